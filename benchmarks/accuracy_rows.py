@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from palpate.images import Role, segment
-from palpate.inversion import InverseProblem, InversionSettings, LaterState, parameter_map, wall_blocks
+from palpate.inversion import InverseProblem, InversionSettings, LaterState
 from palpate.mechanics import ACCURACY, NewtonSettings, finite_strain_model, linear_model, outer_constraint
 from palpate.mesh import LagrangeSpace, lagrange_space, tetrahedralise
 from palpate.observation import observed_surface, prescribed_motion, surface_distance
@@ -34,6 +34,7 @@ from palpate.study import (
     inversion_settings,
     make_body,
 )
+from palpate.unknowns import parameter_map, wall_blocks
 from palpate_validation.truth import exact_target, rescaled
 
 __all__ = ["NOISE", "ROWS", "Posed", "Row", "Truths", "from_voxels", "posed", "truth_of"]

@@ -26,19 +26,19 @@ import numpy as np
 from accuracy import Array, Result, true_ratios
 from accuracy_rows import ROWS, Posed, Truths, posed
 
+from palpate.approximation import LinearisationPoint, exact_approximation
 from palpate.inversion import (
     InverseProblem,
     Inversion,
     InversionSettings,
     Objective,
     OuterIterate,
-    Place,
     StopRule,
-    exact_approximation,
+    begun,
     fit_coefficients,
     invert,
+    minimised,
     posterior_sd,
-    run_outer_loop,
     with_first_noise,
 )
 
@@ -107,27 +107,26 @@ def plain_estimate(
     problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]
 ) -> OuterIterate:
     """The estimate from the middle start, the full model solved with all its derivatives at every place."""
-    theta = np.asarray(np.median(np.stack(settings.starts), axis=0))
+    theta, bounds = np.asarray(np.median(np.stack(settings.starts), axis=0)), settings.bounds
     still = np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
     objective = with_first_noise(_exact(Objective(problem.states, problem.parameters), still)).rematched(still)
-    filled = fit_coefficients(objective, still, bounds=settings.bounds)
-    objective = _exact(objective, filled.unknowns).rematched(filled.unknowns)  # a body at rest shows no modulus
-    filled = replace(filled, evaluation=objective(filled.unknowns))
-    found = run_outer_loop(OuterIterate(objective, filled), settings, RULE, progress=progress, title="linear law")
+    filled = fit_coefficients(objective, still, bounds=bounds)
+    start = replace(begun(_exact(objective, filled.unknowns), filled.unknowns), exact=True)  # at rest no modulus shows
+    found = minimised(start, bounds, RULE, progress=progress, title="linear law")
     if not problem.finite_strain:
         return found
     unknowns = found.minimum.unknowns
-    objective = _exact(found.objective, unknowns, finite_strain=True).rematched(unknowns)
-    start = OuterIterate(objective, replace(found.minimum, evaluation=objective(unknowns)))
-    return run_outer_loop(start, settings, RULE, progress=progress, title="finite strain")
+    start = replace(begun(_exact(found.objective, unknowns, finite_strain=True), unknowns), exact=True)
+    return minimised(start, bounds, RULE, progress=progress, title="finite strain")
 
 
 def _plainly_on(case: Posed, product: Inversion) -> OuterIterate:
     """Where the plain loop leads from the product's answer."""
     unknowns = product.minimum.unknowns
-    objective = _exact(product.objective, unknowns, finite_strain=case.problem.finite_strain).rematched(unknowns)
-    start = OuterIterate(objective, replace(product.minimum, evaluation=objective(unknowns)))
-    return run_outer_loop(start, case.settings, RULE, progress=lambda line: _say(f"  {line}"), title="plainly on")
+    objective = _exact(product.objective, unknowns, finite_strain=case.problem.finite_strain)
+    start = replace(begun(objective, unknowns), exact=True)
+    bounds = case.settings.bounds
+    return minimised(start, bounds, RULE, progress=lambda line: _say(f"  {line}"), title="plainly on")
 
 
 def _exact(objective: Objective, unknowns: Array, *, finite_strain: bool = False) -> Objective:
@@ -135,7 +134,7 @@ def _exact(objective: Objective, unknowns: Array, *, finite_strain: bool = False
     moduli, coefficients = objective.parameters.moduli(unknowns), objective.parameters.coefficients(unknowns)
     models = [(state.model, state.finite_strain if finite_strain else None) for state in objective.states]
     return objective.under(
-        [exact_approximation(*m, Place(moduli, q)) for m, q in zip(models, coefficients, strict=True)]
+        [exact_approximation(*m, LinearisationPoint(moduli, q)) for m, q in zip(models, coefficients, strict=True)]
     )
 
 

@@ -59,7 +59,7 @@ Result = dict[str, Any]  # a line of JSON
 BodyKey = tuple[str, bool, str, str]  # truth, whether points are measured, the estimate's law and the truth's
 
 OUT = 2.0  # half-widths
-NEARLY = StopRule(step_sd=0.2, passes=3)  # what an estimate may still move is little beside what noise does
+NEARLY = StopRule(step_sd=0.2)  # what an estimate may still move is little beside what noise does
 CLEAN = NoiseModel(np.array([2.0 * 0.05**2]), np.array([3.0]))  # of the clean estimate: smaller than any row's
 MOST_TELLING = "field-0.2"  # by whose clean estimate all points are followed: it sees what the others see
 NO_GRID = 3  # draws of a voxel grid, in which nothing is off
@@ -221,7 +221,7 @@ def _observations(body: Body, row: Row, rng: np.random.Generator) -> list[Observ
 def _moduli(inversion: Inversion, body: Body, row: Row) -> list[Result]:
     """By tissue: the error of ln E, its standard deviation, the ends of its intervals less the truth, the verdict."""
     objective, minimum = inversion.objective, inversion.minimum
-    errors = [[np.zeros(len(line.weights)) for line in minimum.evaluation.lines]] * NO_GRID
+    errors = [[np.zeros(len(line.weights)) for line in minimum.evaluation.linearisations]] * NO_GRID
     bonded = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
     released, remark = released_of(inversion, body.settings)
     covariance, posteriors = stated_posteriors(inversion, bonded, released)
@@ -260,9 +260,9 @@ def _ends(interval: tuple[float | None, float | None], truth: float) -> list[flo
 def _by_true_noise(inversion: Inversion, noise: NoiseModel) -> Array:
     """Covariance (n, n) of the log-moduli that errors as they were drawn make through the estimate's own weights."""
     evaluation, n = inversion.minimum.evaluation, inversion.objective.n_parameters
-    seen = [(line.state, line.observation) for line in evaluation.lines]
+    seen = [(line.state, line.observation) for line in evaluation.linearisations]
     models = {(s, o.kind): noise if isinstance(o, SurfaceDistance) else o.first_noise((o,)) for s, o in seen}
-    pairs = list(zip(evaluation.lines, gain(evaluation, n), strict=True))
+    pairs = list(zip(evaluation.linearisations, gain(evaluation, n), strict=True))
     return noise_covariance(inversion.objective, pairs, models)
 
 

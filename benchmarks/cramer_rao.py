@@ -79,7 +79,7 @@ def model_to_image(line: Linearisation) -> slice:
 
 
 def _whitened_states(evaluation: Evaluation, noise: NoiseModel, cell_mm: float) -> list[_Whitened]:
-    seen = [line for line in evaluation.lines if isinstance(line.observation, SurfaceDistance)]
+    seen = [line for line in evaluation.linearisations if isinstance(line.observation, SurfaceDistance)]
     states = dict.fromkeys(line.state for line in seen)
     return [_whitened([line for line in seen if line.state == s], noise, cell_mm) for s in states]
 
@@ -87,7 +87,7 @@ def _whitened_states(evaluation: Evaluation, noise: NoiseModel, cell_mm: float) 
 def _of_points(evaluation: Evaluation) -> NDArray[np.float64]:
     """J^T J / sd^2 (n, n) of all unknowns by the residuals of points, which have one standard deviation and no more."""
     information = np.zeros_like(evaluation.prior)
-    for line in evaluation.lines:
+    for line in evaluation.linearisations:
         if isinstance(line.observation, PointDisplacement):
             weights = np.full(len(line.weights), line.observation.stated.sd**-2.0)
             information[np.ix_(line.columns, line.columns)] += line.jacobian.gram(weights)

@@ -212,7 +212,7 @@ def _tpu_prediction(block: Block, options: Options, step: int, fit: dict[str, An
     objective, x = inversion.objective, inversion.minimum.unknowns
     parameters = objective.parameters
     moved = objective.states[0].displacement(parameters.moduli(x), parameters.coefficients(x)[0])[: len(block.nodes)]
-    (line,) = (line for line in inversion.minimum.evaluation.lines if line.observation.name == "force")
+    (line,) = (line for line in inversion.minimum.evaluation.linearisations if line.observation.name == "force")
     force = float(line.residuals.values[0])
     half = NORMAL_95 * float(np.hypot(force * sd, options.foot_n))
     inside = ~block.at_ends

@@ -70,7 +70,7 @@ def main() -> int:
     evaluation = there.minimum.evaluation
     weights = _weights(evaluation, noise, there.objective.n_parameters)
     shifts: dict[str, list[NDArray[np.float64]]] = {w.name: [] for w in weights}
-    surfaces = [target_of(line.observation).surface for line in evaluation.lines]
+    surfaces = [target_of(line.observation).surface for line in evaluation.linearisations]
     for draw in range(1, arguments.draws + 1):
         noisy = replace(options, noise=NOISE)
         imaged = reimaged(replace(scene, seed=scene.seed + 1000 * draw), pelvis_grid(noisy), noise=NOISE)
@@ -80,7 +80,7 @@ def main() -> int:
         errors = np.concatenate(
             [
                 target.after.at(line.residuals.places[model_to_image(line)]) - target.rest_distance
-                for line, target in zip(evaluation.lines, targets, strict=True)
+                for line, target in zip(evaluation.linearisations, targets, strict=True)
             ]
         )
         for w in weights:
@@ -98,7 +98,7 @@ def _weights(evaluation: Evaluation, noise: NoiseModel, n: int) -> list[Weights]
         size = max(cell, ALONE)
         rows = np.concatenate(efficient_gain(evaluation, noise, n, cell_mm=size), axis=1)
         found.append(Weights(f"limit, cells of {cell:g} mm", rows, cramer_rao(evaluation, noise, n, cell_mm=size)))
-    pairs = zip(gain(evaluation, n), evaluation.lines, strict=True)
+    pairs = zip(gain(evaluation, n), evaluation.linearisations, strict=True)
     # half of the weight is on each direction of the distance, which see the same error
     own = np.concatenate([2.0 * row[:, model_to_image(line)] for row, line in pairs], axis=1)
     return [*found, Weights("the estimator's own", own, None)]
@@ -109,7 +109,7 @@ def _row(
 ) -> dict[str, object]:
     """Standard deviations of the log-moduli: as promised, and as the draws scatter, with the prior's part."""
     n = len(names)
-    jacobian = np.concatenate([line.jacobian.of_rows(model_to_image(line)).dense for line in evaluation.lines])
+    jacobian = np.concatenate([line.jacobian.of_rows(model_to_image(line)).dense for line in evaluation.linearisations])
     by_modes = weights.rows @ jacobian[:, n:]  # modes that the weights do not keep out of the moduli
     by_prior = by_modes @ np.linalg.solve(evaluation.prior[n:, n:], by_modes.T)
     scatter = np.sqrt(np.diag(np.cov(shifts.T) + by_prior))

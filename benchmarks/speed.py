@@ -30,16 +30,16 @@ from speed_default import default_case, mapped_organ, measured_field, other_sign
 from speed_maps import beside_a_peer
 from speed_stages import shares_of_stages
 
+from palpate.approximation import ReducedBasis, reduced_basis
 from palpate.images import segment
 from palpate.inversion import (
     InverseProblem,
     Inversion,
     InversionSettings,
     Objective,
-    ReducedBasis,
+    frozen_posterior,
     invert,
     posterior_sd,
-    reduced_basis,
 )
 from palpate.mechanics import expected_of_size, linear_model, outer_constraint
 from palpate.mesh import lagrange_space, tetrahedralise
@@ -56,7 +56,7 @@ from palpate.study import (
     inversion_settings,
     make_body,
 )
-from palpate.uncertainty import frozen_posterior, posterior_chains, sandwich_covariance
+from palpate.uncertainty import posterior_chains, sandwich_covariance
 
 PARTS = "solver,linear,nonlinear,gradient,posterior,scaling,front_end,default,signals,field,map"
 IN_A_ROW = 20  # gradients, as an optimiser asks for them

@@ -18,21 +18,13 @@ from scipy import optimize, sparse
 from speed_peers import torch_fem_modules
 
 from palpate.images import FieldPrior, Role, Tissue
-from palpate.inversion import (
-    Bounds,
-    InverseProblem,
-    InversionSettings,
-    LaterState,
-    invert,
-    material_blocks,
-    parameter_map,
-    unit_blocks,
-)
+from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, invert
 from palpate.mechanics import law_named, linear_model, material_modes, outer_constraint
 from palpate.mesh import Anatomy, LagrangeSpace, lagrange_space, located, point_interpolation, tetrahedralise
 from palpate.observation import DataFile, DisplacementField, PointDisplacement, PointTable
 from palpate.phantoms import AffineMotion, BoundaryMotion, ball, centred_grid, displacements, grid_box
 from palpate.uncertainty import sandwich_covariance, stiffness_maps
+from palpate.unknowns import material_blocks, parameter_map, unit_blocks
 from palpate_validation.mismatch import patched
 
 __all__ = ["beside_a_peer"]

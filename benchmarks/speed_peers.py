@@ -44,7 +44,7 @@ def frozen_misfit(objective: Objective, unknowns: Array) -> FrozenMisfit:
     values = state.displacement(moduli, coefficients).ravel()
     n_dof = 1 + max(int(observation.dofs.max()) for observation in state.observations)
     designs, rests = [], []
-    for line in objective(unknowns).lines:
+    for line in objective(unknowns).linearisations:
         scale, dofs = np.sqrt(line.precision * line.weights), line.observation.dofs
         plane = sparse.csr_matrix(sparse.diags_array(scale) @ line.residuals.smooth_jacobian)
         spread = sparse.csr_matrix((np.ones(len(dofs)), (np.arange(len(dofs)), dofs)), shape=(len(dofs), n_dof))

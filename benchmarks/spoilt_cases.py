@@ -40,7 +40,7 @@ CASES: tuple[dict[str, Any], ...] = (
         "driver": {"modes": 6, "kernel_mm": 20.0, "prior_mm": 5.0, "learn_prior": False},
         "noise": {"surface_sd_mm": 0.3, "correlation_length_mm": 6.0},
         "estimate": {
-            "method": "lbfgs",
+            "method": "gauss-newton",
             "parameters": ["youngs_modulus"],
             "starts_kpa": [9.0],
             "bounds_kpa": [1.0, 99.0],

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inversion import parameter_map, unit_blocks
 from palpate.mechanics.linear_model import linear_model
 from palpate.observation.observed_surface import observed_surface
+from palpate.unknowns import parameter_map, unit_blocks
 from palpate_validation.paper.balls import (
     BODIES,
     Balls,

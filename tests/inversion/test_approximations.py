@@ -10,9 +10,16 @@ from dataclasses import FrozenInstanceError, dataclass, fields, replace
 import numpy as np
 import pytest
 
-import palpate.inversion
-from palpate.inversion import Approximation, ExactApproximation, Place, ReducedBasis, exact_approximation, reduced_basis
-from palpate.inversion.expansion import Expansion, coarse_equilibrium, expansion_around
+import palpate.approximation
+from palpate.approximation import (
+    Approximation,
+    ExactApproximation,
+    LinearisationPoint,
+    ReducedBasis,
+    exact_approximation,
+    reduced_basis,
+)
+from palpate.approximation.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.mechanics.conditions import Conditions
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
@@ -25,9 +32,9 @@ MEMBERS = [name for name in vars(Approximation) if not name.startswith("_")]
 
 
 def implementations():
-    """All classes of the inversion that have every member of the contract."""
+    """All classes among the approximations that have every member of the contract."""
     found = set()
-    for module in pkgutil.walk_packages(palpate.inversion.__path__, "palpate.inversion."):
+    for module in pkgutil.walk_packages(palpate.approximation.__path__, "palpate.approximation."):
         for _, kind in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
             own = kind.__module__ == module.name and kind is not Approximation
             if own and all(hasattr(kind, member) for member in MEMBERS):
@@ -91,13 +98,13 @@ def body(kind, twin):
 
 @pytest.fixture(scope="module")
 def here(twin):
-    return Place(np.array([16.0, 14.0, 10.0]), 0.5 * twin.coefficients)
+    return LinearisationPoint(np.array([16.0, 14.0, 10.0]), 0.5 * twin.coefficients)
 
 
 @pytest.fixture(scope="module")
 def there(twin):
     """Ten per cent from `here` in the moduli and in the motion."""
-    return Place(np.array([17.6, 12.6, 10.0]), 0.55 * twin.coefficients)
+    return LinearisationPoint(np.array([17.6, 12.6, 10.0]), 0.55 * twin.coefficients)
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +156,7 @@ def test_elsewhere_its_error_is_stated(kind, body, made, there):
 
 
 def test_along_the_directions_wanted_its_derivatives_are_those_of_the_full_model(body, made, deciding, monkeypatch):
-    monkeypatch.setattr("palpate.inversion.expansion.FEW", 0)  # or all of them were made exact
+    monkeypatch.setattr("palpate.approximation.expansion.FEW", 0)  # or all of them were made exact
     updated = made.update(deciding)
     exactly = body.solve(deciding).tangent() @ deciding.directions
     before, after = (
@@ -178,7 +185,7 @@ def test_what_it_cost_grows_with_an_update_and_not_where_it_is_exact_already(mad
     again = updated.update(there)
     assert total(updated.counts) > total(made.counts)
     assert total(again.counts) == total(updated.counts)
-    assert made.reach > 0.0
+    assert made.trust_radius > 0.0
 
 
 def test_what_its_error_costs_is_stated(made, there, monkeypatch):

@@ -8,18 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion import (
-    Acts,
-    Block,
-    InverseProblem,
-    LaterState,
-    invert,
-    material_blocks,
-    offset_block,
-    parameter_map,
-    unit_blocks,
-)
-from palpate.inversion.blocks import frame_blocks
+from palpate.inversion import InverseProblem, LaterState, invert
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.material import material_modes
@@ -32,6 +21,8 @@ from palpate.observation.prescribed_motion import FrameMotion, prescribed_motion
 from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
 from palpate.phantoms.shapes import ball
+from palpate.unknowns import Acts, Block, material_blocks, offset_block, parameter_map, unit_blocks
+from palpate.unknowns.blocks import frame_blocks
 
 DRAWN_MM = 0.3
 

@@ -10,16 +10,9 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from palpate.inversion import (
-    Acts,
-    Block,
-    LaterState,
-    Objective,
-    ParameterMap,
-    evidence,
-    wall_blocks,
-)
+from palpate.inversion import LaterState, Objective, hyper_parameters
 from palpate.observation.wall_modes import Wall, wall_modes, wall_of
+from palpate.unknowns import Acts, Block, ParameterMap, unit_blocks, wall_blocks
 
 N_MODES = 90
 
@@ -58,7 +51,8 @@ def learned_precision(ball, motion, *, sd_mm, seen=None):
     score = -modes.T @ motion.ravel() / sd_mm**2  # at no motion
     prior = np.eye(len(data))
     evaluation = SimpleNamespace(matrix=data + prior, prior=prior, score=score, prior_score=np.zeros(len(data)))
-    return evidence.learned_precision(moved_by(ball.wall), evaluation, np.zeros(len(data)))
+    found = hyper_parameters.with_amplitudes(moved_by(ball.wall), evaluation, np.zeros(len(data)))
+    return found.parameters.nuisance_precision
 
 
 def moved_by(*walls):
@@ -153,7 +147,12 @@ def test_what_is_not_seen_at_all_keeps_a_bounded_prior():
 
 
 def test_walls_that_are_not_given_keep_the_modes_own_prior():
-    assert evidence.learned_precision(moved_by(), None, np.zeros(N_MODES)) is None
+    own = unit_blocks(N_MODES)
+    given = Objective((LaterState(None, ()),), ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, own))
+    evaluation = SimpleNamespace(matrix=2.0 * np.eye(N_MODES), prior=np.eye(N_MODES))
+    evaluation.score = evaluation.prior_score = np.zeros(N_MODES)
+    found = hyper_parameters.with_amplitudes(given, evaluation, np.zeros(N_MODES))
+    assert found.parameters.nuisance_precision == pytest.approx(np.eye(N_MODES))
 
 
 def test_what_is_believed_of_the_others_follows_their_prior_mean_too(rng):
@@ -172,7 +171,8 @@ def test_what_is_believed_of_the_others_follows_their_prior_mean_too(rng):
     x = rng.normal(size=n)
     score = design.T @ (values + design @ x)
     evaluation = SimpleNamespace(matrix=data + prior, prior=prior, score=score, prior_score=np.zeros(n))
-    found = evidence.learned_precision(Objective((LaterState(None, ()),), parameters), evaluation, x)
+    objective = Objective((LaterState(None, ()),), parameters)
+    found = hyper_parameters.with_amplitudes(objective, evaluation, x).parameters.nuisance_precision
 
     def log_evidence(amplitude):
         """ln N(values; -design mean, 1 + design C design^T), all unknowns marginalised."""

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.approximation import expansion
+from palpate.approximation.contract import Derivatives
 from palpate.errors import EstimationError, NotConverged, SolverError
-from palpate.inversion import Outcome, continue_at_finite_strain, estimate, expansion, invert
-from palpate.inversion.approximation import Derivatives
+from palpate.inversion import Outcome, continue_at_finite_strain, estimate, invert
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.registry import law_named
 
@@ -66,7 +67,9 @@ def test_the_derivatives_that_decide_the_moduli_are_those_of_the_equilibrium(bod
     """The other columns may be those of an earlier one."""
     moduli, q, approximation = split(continued)
     there = body[2].solve(moduli, q)
-    directions = continued.objective.places(continued.minimum.unknowns, continued.minimum.evaluation)[0].directions
+    directions = continued.objective.linearisation_points(continued.minimum.unknowns, continued.minimum.evaluation)[
+        0
+    ].directions
     exact, stated = there.tangent() @ directions, approximation.model.derivatives @ directions
     assert np.linalg.norm(stated - exact, axis=0) == pytest.approx(0.0, abs=0.02 * np.linalg.norm(exact))
 
@@ -79,7 +82,7 @@ def test_all_derivatives_are_those_of_the_equilibrium_where_all_are_worth_it(lin
         unknowns = found.minimum.unknowns + np.array([0.3, -0.2, *np.full(len(found.minimum.unknowns) - 2, 0.1)])
         evaluation, missed = found.objective(unknowns), []
         for worth in (Derivatives.DECIDING, Derivatives.ALL):
-            (place,) = found.objective.places(unknowns, evaluation, worth)
+            (place,) = found.objective.linearisation_points(unknowns, evaluation, worth)
             there = found.objective.states[0].approximation.update(place)
             exact = there.equilibrium.tangent()
             missed.append(np.linalg.norm(there.model.derivatives - exact) / np.linalg.norm(exact))

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inversion import Acts, Block, LaterState, invert, material_blocks, parameter_map, posterior_sd, unit_blocks
+from palpate.inversion import LaterState, invert, posterior_sd
 from palpate.inversion import informed_subspace as informed
-from palpate.inversion.evidence import undecided_covariance
+from palpate.inversion.hyper_parameters import undecided_covariance
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.material import material_modes
+from palpate.unknowns import Acts, Block, material_blocks, parameter_map, unit_blocks
 
 
 def spread(rng, n):

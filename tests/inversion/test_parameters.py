@@ -9,10 +9,11 @@ import pytest
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion import Bounds, gauss_newton, invert, layer_blocks, parameter_map, unit_blocks
-from palpate.inversion.blocks import in_series, in_series_slopes, of_series
+from palpate.inversion import Bounds, gauss_newton, invert
 from palpate.inversion.optimise import posterior_sd
 from palpate.observation.noise_model import NoiseModel
+from palpate.unknowns import layer_blocks, parameter_map, unit_blocks
+from palpate.unknowns.blocks import in_series, in_series_slopes, of_series
 
 GLAND, SAC = Tissue("gland", Role.ESTIMATE), Tissue("sac", Role.ESTIMATE)
 NODE = Tissue("node", Role.ESTIMATE)

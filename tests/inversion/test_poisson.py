@@ -7,24 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from palpate.approximation import exact_approximation, reduced_basis
 from palpate.errors import ConfigurationError
-from palpate.inversion import (
-    InverseProblem,
-    LaterState,
-    Objective,
-    ParameterMap,
-    exact_approximation,
-    invert,
-    parameter_map,
-    posterior_sd,
-    reduced_basis,
-    unit_blocks,
-)
+from palpate.inversion import InverseProblem, LaterState, Objective, invert, posterior_sd
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.registry import law_named
 from palpate.mechanics.linear_model import LinearModel, linear_model
 from palpate.observation.noise_model import NoiseModel
+from palpate.unknowns import ParameterMap, parameter_map, unit_blocks
 
 NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))
 KINDS = [("P1", Dilatation.POINTWISE), ("P2", Dilatation.MEAN), ("P2", Dilatation.BLENDED)]
@@ -101,7 +92,7 @@ def test_the_gradient_of_the_objective_has_that_by_poissons_ratio(twins, twin, a
     made, exact = opened(twin, Dilatation.POINTWISE), twins.exact_problem(twin, noise=NOISE)
     state = LaterState(made.model, exact.states[0].observations)
     x = made.unknowns(0.4, q=0.8 * twin.coefficients)
-    (at,) = Objective((state,), made.parameters).places(x)
+    (at,) = Objective((state,), made.parameters).linearisation_points(x)
     basis = reduced_basis(made.model, at.moduli).with_modulus_series(at.coefficients, made.parameters.derivatives(x))
     stands_in = {"exact": exact_approximation(made.model, None, at), "reduced": basis.update(at)}[approximate]
     objective = Objective((state.with_approximation(stands_in),), made.parameters).rematched(x)
@@ -116,7 +107,7 @@ def test_the_gradient_of_the_objective_has_that_by_poissons_ratio(twins, twin, a
 def test_the_reduced_basis_keeps_its_bound_over_poissons_ratio(twin):
     made = opened(twin, Dilatation.POINTWISE)
     x = made.unknowns(0.4)
-    (at, there) = (Objective((), made.parameters).places(of)[0] for of in (x, made.unknowns(0.48)))
+    (at, there) = (Objective((), made.parameters).linearisation_points(of)[0] for of in (x, made.unknowns(0.48)))
     basis = reduced_basis(made.model, at.moduli)
     truth, stated = (m.solve(there.moduli, there.coefficients).values for m in (made.model, basis.model))
     energies = [v @ made.model.forces(there.moduli, v[:, None])[:, 0] for v in (stated - truth, truth)]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.inversion import Place, reduced_basis
+from palpate.approximation import LinearisationPoint, reduced_basis
+from palpate.approximation.reduced_basis import SERIES
 from palpate.inversion.objective import deciding_directions
-from palpate.inversion.reduced_basis import SERIES
 from palpate.observation.noise_model import SEGMENTATION_NOISE
 
 
@@ -59,14 +59,14 @@ def test_a_series_of_tied_tissues_follows_their_common_modulus_with_fewer_vector
     assert energy_error(twin.model, moduli, tied.model.solve(moduli, twin.coefficients).values, truth) < 0.01
     apart = equal * [4.0, 0.25, 1.0]
     assert (
-        tied.error(Place(apart, twin.coefficients)).relative
-        > 10.0 * first.error(Place(apart, twin.coefficients)).relative
+        tied.error(LinearisationPoint(apart, twin.coefficients)).relative
+        > 10.0 * first.error(LinearisationPoint(apart, twin.coefficients)).relative
     )
 
 
 def test_adding_all_responses_makes_it_exact_there_and_keeps_it_where_it_was(first, twin, equal):
     richer = first.with_responses(twin.moduli, twin.coefficients)
-    assert richer.error(Place(twin.moduli, twin.coefficients)).relative < 1e-7
+    assert richer.error(LinearisationPoint(twin.moduli, twin.coefficients)).relative < 1e-7
     elsewhere = richer.model.solve(equal, twin.coefficients)
     assert elsewhere.values == pytest.approx(twin.model.solve(equal, twin.coefficients).values, abs=1e-8)
 
@@ -94,7 +94,7 @@ def directions(twins, twin, exact, first):
 
 
 def test_an_update_makes_displacement_and_deciding_derivatives_exact_there(first, twin, directions):
-    there = Place(twin.moduli, twin.coefficients, directions)
+    there = LinearisationPoint(twin.moduli, twin.coefficients, directions)
     sharper, truth = first.update(there), twin.model.solve(twin.moduli, twin.coefficients)
     found, before = (basis.model.solve(twin.moduli, twin.coefficients) for basis in (sharper, first))
     assert sharper.error(there).relative < 1e-3 * first.error(there).relative
@@ -104,18 +104,18 @@ def test_an_update_makes_displacement_and_deciding_derivatives_exact_there(first
 
 
 def test_an_update_factorises_only_where_the_moduli_are_far(first, twin, directions):
-    near = first.update(Place(twin.moduli, twin.coefficients, directions))
+    near = first.update(LinearisationPoint(twin.moduli, twin.coefficients, directions))
     assert near.counts.factorisations == first.counts.factorisations
     assert near.factorisation is first.factorisation
-    far = Place(twin.moduli * [100.0, 1.0, 1.0], twin.coefficients, directions)
+    far = LinearisationPoint(twin.moduli * [100.0, 1.0, 1.0], twin.coefficients, directions)
     there = first.update(far)
     assert there.counts.factorisations == first.counts.factorisations + 1
     assert there.error(far).relative < 1e-6
 
 
 def test_an_update_where_it_is_exact_already_solves_no_displacement_again(first, twin, directions):
-    once = first.update(Place(twin.moduli, twin.coefficients))
-    twice = once.update(Place(twin.moduli, twin.coefficients, directions))
+    once = first.update(LinearisationPoint(twin.moduli, twin.coefficients))
+    twice = once.update(LinearisationPoint(twin.moduli, twin.coefficients, directions))
     assert twice.counts.forward == once.counts.forward == first.counts.forward + 1
     assert twice.counts.tangent == once.counts.tangent + directions.shape[1]
 
@@ -124,7 +124,7 @@ def test_exact_deciding_derivatives_give_the_posterior_of_the_full_model(twins, 
     """The other columns may be off: the moduli's variance is stationary in them."""
     found = evaluated(twins, exact, plain, twin.unknowns)
     along = exact.parameters.chain(0, twin.unknowns) @ deciding_directions(found, 2)
-    sharper = plain.update(Place(twin.moduli, twin.coefficients, along))
+    sharper = plain.update(LinearisationPoint(twin.moduli, twin.coefficients, along))
     full = plain.with_responses(twin.moduli, twin.coefficients)
     matrices = [evaluated(twins, exact, basis, twin.unknowns).matrix for basis in (plain, sharper, full)]
     variances = [np.diag(np.linalg.inv(matrix))[:2] for matrix in matrices]

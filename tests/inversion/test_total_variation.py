@@ -9,8 +9,8 @@ import pytest
 from scipy import sparse
 
 from palpate.images.tissue import FieldPrior
-from palpate.inversion import Acts, Block
-from palpate.inversion.total_variation import ROUNDING, total_variation
+from palpate.unknowns import Acts, Block
+from palpate.unknowns.total_variation import ROUNDING, total_variation
 
 PRIOR = FieldPrior(0.5, 6.0, total_variation=True)
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from itertools import cycle
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -73,35 +71,6 @@ class Saturating:
         score = slope * (slope - np.exp(self.truth))
         matrix = np.diag(slope**2)
         value = self.value(unknowns)
-        return Evaluation(value, value, score, score, matrix, (), 0.0 * matrix, 0.0 * score)
-
-
-@dataclass(frozen=True)
-class Circling:
-    """Three evaluations in turn, as re-chosen closest points make them: each is progress from the one before."""
-
-    n_parameters: int = 2
-    turns: Iterator[int] = field(default_factory=lambda: cycle(range(3)))
-
-    def __call__(self, _):
-        turn = next(self.turns)
-        value, slope = (1000.0, 1000.8, 1000.5)[turn], (0.28, 0.22, 0.09)[turn]
-        score, matrix = np.array([0.0, 0.0, slope]), np.eye(3)
-        return Evaluation(value, value, score, score, matrix, (), 0.0 * matrix, 0.0 * score)
-
-
-@dataclass
-class Sliding:
-    """Two log-moduli as their model says, and coefficients that answer a fifth of what it says: walls that slide."""
-
-    centre: np.ndarray
-    slides: int = 40
-    n_parameters: int = 2
-
-    def __call__(self, unknowns):
-        away, apart = unknowns[:2] - self.centre, unknowns[2:] - 1.5
-        value, score = 0.5 * away @ away + 0.1 * apart @ apart, np.concatenate([away, 0.2 * apart])
-        matrix = np.eye(2 + self.slides)
         return Evaluation(value, value, score, score, matrix, (), 0.0 * matrix, 0.0 * score)
 
 

@@ -6,20 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from palpate.approximation import reduced_basis
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role, Tissue
 from palpate.images.tissue_distance import tissue_distance_map
-from palpate.inversion import (
-    Bounds,
-    InverseProblem,
-    InversionSettings,
-    LaterState,
-    Objective,
-    parameter_map,
-    reduced_basis,
-    unit_blocks,
-    with_first_noise,
-)
+from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, Objective, with_first_noise
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import LinearModel, linear_model
 from palpate.mesh.anatomy import Anatomy, Box
@@ -32,6 +23,7 @@ from palpate.observation.target import surface_target
 from palpate.phantoms.motion import smooth_field
 from palpate.phantoms.scene import Scene, centred_grid, imaged
 from palpate.phantoms.shapes import ball
+from palpate.unknowns import parameter_map, unit_blocks
 from palpate_validation.truth import exact_target, target_of_truth
 
 BALLS = (ball([0.0, -9.0, -4.0], 8.0), ball([0.0, -4.0, 11.0], 7.0), ball([0.0, 9.0, -2.0], 7.0))

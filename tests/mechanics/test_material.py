@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from palpate.approximation.contract import LinearisationPoint
+from palpate.approximation.reduced_basis import reduced_basis
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion.approximation import Place
-from palpate.inversion.reduced_basis import reduced_basis
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import finite_strain_model
@@ -144,8 +144,8 @@ def test_a_reduced_basis_tells_what_its_responses_to_the_material_miss_elsewhere
     """All of them are those at the moduli where it was made, its displacement of homogeneous tissues is exact."""
     model, (boundary, material) = linear_model(*body, material=modes), coefficients
     moduli = MODULI * [1.4, 1.0]
-    there = Place(moduli, np.concatenate([boundary, material]))
-    homogeneous = Place(moduli, np.concatenate([boundary, 0.0 * material]))
+    there = LinearisationPoint(moduli, np.concatenate([boundary, material]))
+    homogeneous = LinearisationPoint(moduli, np.concatenate([boundary, 0.0 * material]))
     first = reduced_basis(model, MODULI)
     first = first.with_material(first.system.material_responses(model.solve(MODULI, homogeneous.coefficients).values))
     basis = first.update(homogeneous)

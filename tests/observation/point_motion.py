@@ -9,7 +9,7 @@ from scipy import sparse
 
 from palpate.observation.contract import Fit, Residuals, Weighting
 from palpate.observation.noise_model import NoiseModel
-from palpate.observation.robust_loss import Tukey
+from palpate.observation.robust_loss import PowerLaw
 
 APART = 0.5  # mm: correlation length; the three axes of a point are independent anyway
 
@@ -43,10 +43,20 @@ class PointMotion:
         return Residuals(displacement - self.seen + offset, weights, places, np.eye(3), material, identity, identity)
 
     def with_noise(self, noise):
-        return replace(self, noise_model=noise, weighting=Weighting(3.0 / noise.sd**2, Tukey()))
+        return replace(self, noise_model=noise, weighting=Weighting(3.0 / noise.sd**2, PowerLaw(), 3.0))
 
-    def reweighted(self, _residuals, _beyond_modes=None):
-        return self
+    @property
+    def sd_bounds(self):
+        return self.stated_noise.sd, self.stated_noise.sd
+
+    def with_sd(self, sd):
+        return replace(self, weighting=Weighting(3.0 / sd**2, PowerLaw(), 3.0))
+
+    def with_correlation(self, noise):
+        return replace(self, noise_model=noise)
+
+    def weighed(self, residuals):
+        return residuals
 
     def first_noise(self, _peers):
         return self.stated_noise
@@ -62,4 +72,4 @@ class PointMotion:
 def point_motion(point, rest, seen, *, sd_mm) -> PointMotion:
     """The observation of one point by its number, with noise of sd_mm."""
     noise = NoiseModel(np.array([sd_mm**2]), np.array([APART]))
-    return PointMotion(point, rest, seen, noise, noise, Weighting(1.0, Tukey())).with_noise(noise)
+    return PointMotion(point, rest, seen, noise, noise, Weighting(1.0, PowerLaw())).with_noise(noise)

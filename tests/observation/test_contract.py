@@ -20,7 +20,7 @@ from palpate.observation.force import Force
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
-from palpate.observation.robust_loss import Tukey
+from palpate.observation.robust_loss import PowerLaw
 from palpate.observation.surface_distance import SurfaceDistance, surface_distance
 from palpate.observation.target import surface_target, target_from
 from palpate.phantoms.shapes import Ellipsoid, rotation_about
@@ -126,7 +126,7 @@ class Spring:
 def of_force(_sphere, _point_motion):
     noise = NoiseModel(np.array([0.04]), np.array([1e-3]))
     spring = Spring(np.arange(6), np.zeros(3))
-    term = Force("force", spring, np.eye(3)[2], 1.5, noise, noise, Weighting(25.0, Tukey()))
+    term = Force("force", spring, np.eye(3)[2], 1.5, noise, noise, Weighting(25.0, PowerLaw()))
     return term.under(np.array([2.0, 3.0]), np.zeros(2))
 
 
@@ -210,8 +210,8 @@ def test_the_jacobians_and_their_transposes_are_adjoint(case, rng):
 
 
 def test_weights_sum_to_one_whatever_has_been_done(case):
-    seen, found = case.seen, case.residuals
-    others = [rematched(case), seen.with_noise(NOISE), seen.with_noise(NOISE).reweighted(found)]
+    seen = case.seen
+    others = [rematched(case), seen.with_noise(NOISE), seen.with_correlation(NOISE), seen.with_sd(0.2)]
     for one in (seen, *others):
         weights = one.residuals(case.place).weights
         assert weights.sum() == pytest.approx(1.0)
@@ -221,7 +221,7 @@ def test_weights_sum_to_one_whatever_has_been_done(case):
 def test_nothing_that_it_is_asked_changes_it(case):
     seen, before = case.seen, case.residuals
     held = {member.name: getattr(seen, member.name) for member in fields(seen)}
-    others = [rematched(case), seen.with_noise(NOISE), seen.reweighted(before)]
+    others = [rematched(case), seen.with_noise(NOISE), seen.with_correlation(NOISE), seen.with_sd(0.2)]
     seen.fitted_noise([before])
     assert all(type(one) is type(seen) for one in others)
     assert all(getattr(seen, name) is value for name, value in held.items())
@@ -238,6 +238,21 @@ def test_residuals_count_by_the_variance_of_their_noise(case):
     assert fine.noise_model.sd == pytest.approx(0.1)
     assert fine.weighting.precision == pytest.approx(4.0 * rough.weighting.precision)
     assert fine.weighting.loss.weight(np.array([-1e3, 1e3])).tolist() == [1.0, 1.0]
+
+
+def test_another_scale_is_another_weight_and_the_same_number_of_residuals(case):
+    low, high = case.seen.sd_bounds
+    assert 0.0 < low <= high
+    one, two = (case.seen.with_sd(sd).weighting for sd in (0.1, 0.2))
+    assert one.sd == pytest.approx(0.1)
+    assert one.count == two.count == case.seen.weighting.count
+    assert one.precision == pytest.approx(4.0 * two.precision)
+    assert case.seen.with_sd(0.2).with_correlation(NOISE).weighting.sd == pytest.approx(0.2)
+
+
+def test_residuals_are_weighed_as_they_are_made(case):
+    there = case.seen.with_correlation(NOISE)
+    assert there.weighed(case.residuals).weights == pytest.approx(there.residuals(case.place).weights)
 
 
 def test_noise_is_known_before_residuals_tell_and_after(case):
@@ -258,15 +273,12 @@ def test_a_bias_of_both_distance_maps_changes_nothing(make, sphere, point_motion
     """Of every observation that is made of them."""
     plain, biased = (make(sphere, point_motion, bias) for bias in (0.0, 0.35))
     place = 0.3 * rng.standard_normal(n_seen(plain)) + np.tile([1.0, 0.0, 0.0], n_seen(plain) // 3)
-    for change in (lambda o: o, lambda o: o.rematched(place), lambda o: o.reweighted(o.residuals(place))):
+    for change in (lambda o: o, lambda o: o.rematched(place)):
         found = [change(seen).residuals(place) for seen in (plain, biased)]
         assert found[1].values == pytest.approx(found[0].values, abs=1e-9)
         assert found[1].weights == pytest.approx(found[0].weights, abs=1e-9)
         assert abs(found[1].jacobian - found[0].jacobian).max() < 1e-9
         assert np.std(found[0].values) > 0.1
-    assert biased.reweighted(found[1]).weighting.precision == pytest.approx(
-        plain.reweighted(found[0]).weighting.precision, rel=1e-6
-    )
 
 
 @pytest.mark.parametrize("make", [of_points, of_markers, of_means])

@@ -102,14 +102,6 @@ def test_a_further_pair_has_a_mesh_that_is_told_of(two_pairs):
     assert "Each of 2 pairs of images had a mesh of its own" in " ".join(methods_text(collect(two_pairs)).paragraphs)
 
 
-def test_another_optimiser_is_another_source(case_result):
-    options = dataclasses.replace(case_result.case.estimate, method="lbfgs")
-    case = dataclasses.replace(case_result.case, estimate=options)
-    text = methods_text(collect(dataclasses.replace(case_result, case=case)))
-    assert any("Byrd" in source for source in text.sources)
-    assert not any("Nocedal J, Wright" in source for source in text.sources)
-
-
 def test_the_bibtex_of_palpate_is_that_of_citation_cff(case_result):
     citation = (Path(__file__).parents[2] / "CITATION.cff").read_text()
     entry = methods_text(collect(case_result)).bibtex.partition("\n\n")[0]

@@ -9,9 +9,9 @@ import pytest
 
 from palpate.errors import NotConverged
 from palpate.images.tissue import Role
-from palpate.inversion import Inversion, Outcome, OuterIterate, gauss_newton, invert, known_modulus_blocks
+from palpate.inversion import Inversion, Outcome, OuterIterate, frozen_posterior, gauss_newton, invert
 from palpate.inversion.estimate import Candidate
-from palpate.inversion.outer_loop import Convergence
+from palpate.inversion.trust_region import Convergence
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
@@ -20,12 +20,12 @@ from palpate.study.together import StatedPosterior
 from palpate.study.verdicts import hull, verdict
 from palpate.uncertainty import (
     FittedState,
-    frozen_posterior,
     grid_position_shifts,
     mesh_covariance,
     sandwich_covariance,
 )
 from palpate.uncertainty.covariance import scatter
+from palpate.unknowns import known_modulus_blocks
 
 NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))
 
@@ -137,7 +137,7 @@ def test_every_start_has_its_own_steps_and_the_outer_loop_stands_once(estimation
     assert not set(gland[0]) & set(gland[1])
     outer = [step.moduli["gland"] for step in estimation.outer_loop]
     assert len(outer) == len(inversion.minimum.history) >= 1
-    assert any(outer[0] == pytest.approx(start.end["gland"]) for start in estimation.starts)
+    assert all(outer[0] == pytest.approx(start.end["gland"], rel=0.05) for start in estimation.starts)  # one minimum
     assert outer[-1] == pytest.approx(estimation.estimates[0].value)
 
 
@@ -241,10 +241,13 @@ def test_a_minimum_without_equilibrium_is_remarked_and_no_minimum_to_compare_wit
 
 def test_an_estimate_whose_outer_loop_ran_out_says_what_is_open(estimation, inversion, settings, observed):
     assert "unsettled" not in codes(estimation)
-    result = stated(with_candidate(inversion, convergence=Convergence(2.0, 0.5, 0.1)), settings, observed)
+    out_of_steps = replace(inversion.minimum, outcome=Outcome.STEPS)
+    ended = with_candidate(inversion, minimum=out_of_steps, convergence=Convergence(2.0, 0.5, 0.1))
+    result = stated(spoilt(ended, Outcome.STEPS), settings, observed)
     (remark,) = (remark for remark in result.remarks if remark.code == "unsettled")
-    assert "still change each other" in remark.message
+    assert "still moves" in remark.message
     assert "linearised anew" not in remark.message
+    assert result.status == "not converged"
 
 
 def with_range(twins, twin, settings, *, sd):

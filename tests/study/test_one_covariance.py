@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from palpate.images.tissue import Role
-from palpate.inversion import invert, layer_blocks
+from palpate.inversion import invert
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
 from palpate.uncertainty import FittedState
 from palpate.uncertainty.intervals import NORMAL_95
 from palpate.uncertainty.joint_region import LEVEL
+from palpate.unknowns import layer_blocks
 
 NOISE = NoiseModel(np.array([0.1**2]), np.array([3.0]))
 SD = 0.25  # of ln E of the known tissue, which as a whole is the layer: no image tells anything of it

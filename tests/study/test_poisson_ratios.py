@@ -15,7 +15,6 @@ from palpate.cli.outcome import estimates_table
 from palpate.errors import ConfigurationError, NotConverged
 from palpate.export.fitted_model import fitted_model
 from palpate.images.readers import write_label_image
-from palpate.inversion import eta_of_ratio, parameter_map, ratio_of_eta, unit_blocks
 from palpate.mechanics.linear_model import linear_model
 from palpate.report.case_report import write_case_report, write_failure_report
 from palpate.study.case import Estimate, Mechanics
@@ -25,6 +24,7 @@ from palpate.study.poisson_ratios import PoissonRatioEstimate, ratio_verdict, wi
 from palpate.study.result import failure_document
 from palpate.study.sensitivity import sensitivity
 from palpate.uncertainty import Covariance
+from palpate.unknowns import eta_of_ratio, parameter_map, ratio_of_eta, unit_blocks
 from scenes import coarse_balls
 
 CASE = """

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from palpate.inversion import invert
+from palpate.inversion import fixed_correspondence, invert
 from palpate.inversion.objective import Evaluation
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimate_findings import pair_findings
 from palpate.study.together import ImagePairs, PairAlone, StatedPosterior, combinations_of, image_pairs_of, regions_of
-from palpate.uncertainty import fixed_correspondence, sandwich_covariance
+from palpate.uncertainty import sandwich_covariance
 
 NOISE = NoiseModel(np.array([0.1**2]), np.array([3.0]))
 
@@ -54,7 +54,7 @@ def single(twins, twin, settings):
 
 
 def no_errors(inversion):
-    return [[np.zeros(len(line.weights)) for line in inversion.minimum.evaluation.lines]] * 8
+    return [[np.zeros(len(line.weights)) for line in inversion.minimum.evaluation.linearisations]] * 8
 
 
 def test_later_images_are_stated_in_kpa_each_alone(both, settings):

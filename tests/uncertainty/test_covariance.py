@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from palpate.errors import EstimationError
-from palpate.inversion import LaterState, Objective, ParameterMap, unit_blocks
+from palpate.inversion import LaterState, Objective
 from palpate.inversion.objective import Evaluation, Linearisation, deciding_directions
 from palpate.inversion.optimise import Minimum, Outcome, posterior_sd
 from palpate.observation.contract import Residuals, Weighting
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import NoiseModel
-from palpate.observation.robust_loss import Tukey
+from palpate.observation.robust_loss import PowerLaw
 from palpate.phantoms.motion import smooth_field
 from palpate.uncertainty import NORMAL_95, FittedState, gain, sandwich_covariance
 from palpate.uncertainty.covariance import (
@@ -26,6 +26,7 @@ from palpate.uncertainty.covariance import (
     scatter,
 )
 from palpate.uncertainty.intervals import log_interval
+from palpate.unknowns import ParameterMap, unit_blocks
 
 SD = 0.3
 
@@ -60,7 +61,7 @@ def surface(places, normals, jacobian, *, precision, noise, state=0, kind="surfa
     residuals = Residuals(np.zeros(n), weights, places, normals, places, None, None)
     columns = np.arange(jacobian.shape[1])
     return Linearisation(
-        Seen(noise, Weighting(precision, Tukey()), state, kind, of_driver),
+        Seen(noise, Weighting(precision, PowerLaw()), state, kind, of_driver),
         state,
         residuals,
         columns,
@@ -265,8 +266,8 @@ def test_later_states_of_one_rest_state_have_the_same_image_of_it(twins, twin, i
 
     def errors(reference):
         states = (objective.states[0], replace(objective.states[0], reference=reference))
-        lines = [*evaluation.lines, *(replace(line, state=1) for line in evaluation.lines)]
-        both = replace(evaluation, lines=tuple(lines))
+        lines = [*evaluation.linearisations, *(replace(line, state=1) for line in evaluation.linearisations)]
+        both = replace(evaluation, linearisations=tuple(lines))
         found = imaging_errors(replace(objective, states=states), both, (state, state), rng=np.random.default_rng(3))
         first, second = np.concatenate(found[:3]), np.concatenate(found[3:])
         return np.corrcoef(first, second)[0, 1]
@@ -305,9 +306,9 @@ def test_the_grid_adds_to_stated_noise_and_to_what_residuals_tell_what_that_lack
     assert grid_covariance(told, noise, 1.1 * noise) == pytest.approx(np.zeros((3, 3)), abs=1e-12)
     lines = [
         replace(line, observation=replace(line.observation, stated_noise=NoiseModel(np.ones(1), np.ones(1))))
-        for line in told.lines
+        for line in told.linearisations
     ]
-    assert np.array_equal(grid_covariance(replace(told, lines=tuple(lines)), grid, noise), grid)
+    assert np.array_equal(grid_covariance(replace(told, linearisations=tuple(lines)), grid, noise), grid)
 
 
 def test_nothing_is_taken_from_what_is_known_of_fewer_unknowns(rng):

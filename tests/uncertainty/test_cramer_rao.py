@@ -11,17 +11,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from palpate.inversion import Evaluation, LaterState, Objective, ParameterMap, unit_blocks
+from palpate.inversion import Evaluation, LaterState, Objective
 from palpate.inversion.objective import Linearisation
 from palpate.mesh import lagrange_space, located, point_interpolation
 from palpate.observation.contract import DataFile, Residuals, Weighting, seen_by
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.point_displacement import point_displacement
-from palpate.observation.robust_loss import Tukey
+from palpate.observation.robust_loss import PowerLaw
 from palpate.observation.surface_distance import SurfaceDistance
 from palpate.phantoms.motion import smooth_field
 from palpate.uncertainty import sandwich_covariance
+from palpate.unknowns import ParameterMap, unit_blocks
 from palpate_validation.structured_meshes import box_mesh
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "cramer_rao.py"
@@ -53,7 +54,7 @@ def seen(jacobian):
     places, normals = sphere()
     n, weights = len(places), np.full(len(places), 1.0 / len(places))
     target = SimpleNamespace(area=np.ones(n), surface=SimpleNamespace(driver=False))
-    surface = SurfaceDistance(target, None, NOISE, Weighting(PRECISION, Tukey()), stated_noise=NOISE)
+    surface = SurfaceDistance(target, None, NOISE, Weighting(PRECISION, PowerLaw()), stated_noise=NOISE)
     residuals = Residuals(np.zeros(n), weights, places, normals, places, None, None)
     line = Linearisation(surface, 0, residuals, np.arange(5), Jacobian.of(jacobian), weights, None)
     prior = np.diag([0.0, 0.0, 1.0, 1.0, 1.0])
@@ -83,7 +84,9 @@ def test_the_weights_of_the_limit_attain_it_under_noise_of_its_model(limits, smo
     now, rng = smooth[1], np.random.default_rng(20240511)
     places, normals = sphere()
     rows, *_ = limits.efficient_gain(now, NOISE, 2, cell_mm=5.0)
-    kept = np.eye(5)[:2] - rows @ now.lines[0].jacobian.dense  # what is not seen of the unknowns comes from their prior
+    kept = (
+        np.eye(5)[:2] - rows @ now.linearisations[0].jacobian.dense
+    )  # what is not seen of the unknowns comes from their prior
     assert kept[:, :2] == pytest.approx(np.zeros((2, 2)), abs=1e-9)  # no bias in the log-moduli
     fields = (smooth_field(rng, sd_mm=NOISE.sd, correlation_mm=5.0, features=200) for _ in range(400))
     draws = [rows @ np.einsum("na,na->n", field.at(places), normals) for field in fields]
@@ -124,7 +127,7 @@ def test_points_tell_what_their_stated_covariance_leaves(limits, smooth):
     told = Jacobian.of(term.whitening @ seen_by(term, tangent))
     doubtful = term.with_noise(NoiseModel(np.array([4.0]), np.array([1.0])))
     line = Linearisation(doubtful, 0, None, np.arange(5), told, np.full(60, 1.0 / 60.0), None)
-    evaluation = replace(smooth[1], lines=(*smooth[1].lines, line))
+    evaluation = replace(smooth[1], linearisations=(*smooth[1].linearisations, line))
     whole = np.kron(point_interpolation(space, places).toarray(), np.eye(3)) @ tangent
     expected = whole.T @ np.linalg.solve(np.kron(np.eye(20), file.covariance_mm2), whole)
     alone, together = (limits.fisher_information(of, NOISE, cell_mm=5.0) for of in (smooth[1], evaluation))

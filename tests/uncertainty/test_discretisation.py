@@ -8,10 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from palpate.inversion import LaterState, Objective, parameter_map, unit_blocks
+from palpate.inversion import LaterState, Objective
 from palpate.mesh import lagrange_space
 from palpate.uncertainty import discretisation_sd
 from palpate.uncertainty.covariance import mesh_covariance
+from palpate.unknowns import parameter_map, unit_blocks
 from palpate_validation.structured_meshes import box_mesh, known, unknown
 
 TISSUES = (unknown("gland"), unknown("sac"), known("fat"))

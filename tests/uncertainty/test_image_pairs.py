@@ -99,7 +99,7 @@ def joint(twins):
 def errors_of(evaluation, rng=None, size=0.0):
     """Of 8 draws, independent ones of a `size` in mm."""
     rng = rng or np.random.default_rng(0)
-    return [[size * rng.standard_normal(len(line.weights)) for line in evaluation.lines] for _ in range(8)]
+    return [[size * rng.standard_normal(len(line.weights)) for line in evaluation.linearisations] for _ in range(8)]
 
 
 def alone(joint, *, reference=0, **changes):

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inversion import Bounds, Outcome, gauss_newton
+from palpate.inversion import Bounds, Outcome, fixed_correspondence, gauss_newton
 from palpate.uncertainty.joint_region import DIRECTIONS, LEVEL, joint_region
-from palpate.uncertainty.profile import fixed_correspondence, profile
+from palpate.uncertainty.profile import profile
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
 
@@ -69,9 +69,9 @@ def test_the_order_of_the_two_is_that_of_the_columns(fixed, minimum, covariance,
 def test_a_fit_that_does_not_end_leaves_the_region_open(objective, minimum, covariance, monkeypatch):
     """With two moduli held, the drivers' motion is not."""
 
-    def ended(of, start, *, held=False, **given):
-        found = gauss_newton(of, start, held=held, **given)
-        return replace(found, evaluation=of(start), unknowns=start, outcome=Outcome.STUCK) if np.any(held) else found
+    def ended(of, start, *, fixed=False, **given):
+        found = gauss_newton(of, start, fixed=fixed, **given)
+        return replace(found, evaluation=of(start), unknowns=start, outcome=Outcome.STUCK) if np.any(fixed) else found
 
     monkeypatch.setattr("palpate.uncertainty.profile.gauss_newton", ended)
     fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inversion import Bounds, Outcome, gauss_newton
+from palpate.inversion import Bounds, Outcome, fixed_correspondence, frozen_posterior, gauss_newton
 from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.first_order import expanded
 from palpate.mechanics.laws.registry import law_named
-from palpate.uncertainty import NORMAL_95, frozen_posterior, posterior_chains
-from palpate.uncertainty.profile import fixed_correspondence, profile
+from palpate.uncertainty import NORMAL_95, posterior_chains
+from palpate.uncertainty.profile import profile
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
 
@@ -44,7 +44,7 @@ def test_at_the_ends_the_objective_is_higher_by_the_level_at_its_best(objective,
     for end in (found.low, found.high):
         start = minimum.unknowns.copy()
         start[0] = end
-        best = gauss_newton(fixed, start, bounds=WIDE, held=np.array([True, False]), tolerance=1e-8)
+        best = gauss_newton(fixed, start, bounds=WIDE, fixed=np.array([True, False]), tolerance=1e-8)
         assert best.unknowns[0] == end
         assert 2.0 * (best.evaluation.value - least) == pytest.approx(NORMAL_95**2, rel=0.05)
 
@@ -71,9 +71,9 @@ def test_it_leans_as_the_posterior_does(objective, minimum, variance, rng):
 def test_a_fit_that_does_not_end_makes_no_interval_narrower(objective, minimum, variance, monkeypatch):
     """Its deviance is too large, so that the level seems to be reached too soon."""
 
-    def ended(of, start, *, held=False, **given):
-        found = gauss_newton(of, start, held=held, **given)
-        return replace(found, evaluation=of(start), unknowns=start, outcome=Outcome.STUCK) if np.any(held) else found
+    def ended(of, start, *, fixed=False, **given):
+        found = gauss_newton(of, start, fixed=fixed, **given)
+        return replace(found, evaluation=of(start), unknowns=start, outcome=Outcome.STUCK) if np.any(fixed) else found
 
     wholes = [profiled(objective, minimum, number, variance[number]) for number in range(2)]
     monkeypatch.setattr("palpate.uncertainty.profile.gauss_newton", ended)

@@ -9,13 +9,11 @@ import pytest
 from scipy import stats
 
 from palpate.errors import ConfigurationError
-from palpate.inversion import Bounds, gauss_newton
+from palpate.inversion import Bounds, fixed_correspondence, frozen_posterior, gauss_newton
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.first_order import expanded
 from palpate.mechanics.laws.registry import law_named
 from palpate.observation.noise_model import NoiseModel
-from palpate.uncertainty.frozen_posterior import frozen_posterior
-from palpate.uncertainty.profile import fixed_correspondence
 from palpate.uncertainty.sampling import posterior_chains
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))

@@ -18,7 +18,7 @@ from palpate.mechanics.reaction import surface_reaction
 from palpate.observation.contract import Weighting, seen_by
 from palpate.observation.force import Force
 from palpate.observation.noise_model import NoiseModel
-from palpate.observation.robust_loss import Tukey
+from palpate.observation.robust_loss import PowerLaw
 from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
 from palpate.uncertainty import (
@@ -93,7 +93,7 @@ def test_a_force_changes_with_poissons_ratio_as_differences_say(twin, dilatation
         model = with_poisson(twin, {"rest": ratio}, dilatation)
         there = model.solve(twin.moduli, twin.coefficients)
         reaction = surface_reaction(model.space, triangles, direction, law_named("linear"), dilatation=dilatation)
-        term = Force("force", reaction, direction, 0.0, stated, stated, Weighting(1.0, Tukey()))
+        term = Force("force", reaction, direction, 0.0, stated, stated, Weighting(1.0, PowerLaw()))
         seen = term.under(twin.moduli, np.zeros(0)).residuals(there.values[term.dofs])
         return term, there, seen
 
@@ -117,7 +117,7 @@ def test_both_laws_say_the_same_of_poissons_ratio_in_a_small_motion(twin):
 
 
 def test_what_is_not_changed_moves_nothing(path, found):
-    still = path.under(tuple(np.zeros(len(line.residuals.values)) for line in found.minimum.evaluation.lines))
+    still = path.under(tuple(np.zeros(len(line.residuals.values)) for line in found.minimum.evaluation.linearisations))
     assert still.converged
     assert not still.at_bound.any()
     assert still.theta == pytest.approx(0.0, abs=1e-4)
@@ -140,7 +140,7 @@ def test_a_step_to_another_law_ends_at_its_equilibrium(found):
     finite = finite_strain_model(model.space, model.constraint, law, dilatation=Dilatation.POINTWISE)
     exact = finite.solve(there.system.moduli, there.coefficients).values - there.values
     errors = law_errors(evaluation, (there,), law, Dilatation.POINTWISE)
-    expected = [line.residuals.smooth_jacobian @ seen_by(line.observation, exact) for line in evaluation.lines]
+    expected = [line.residuals.smooth_jacobian @ seen_by(line.observation, exact) for line in evaluation.linearisations]
     largest = np.abs(np.concatenate(expected)).max()
     assert largest > 0.05
     assert np.concatenate(errors) == pytest.approx(np.concatenate(expected), abs=0.02 * largest)
@@ -177,7 +177,7 @@ def test_a_surface_drawn_elsewhere_moves_the_estimate_as_foretold(twins, found, 
 
 def test_an_organ_takes_from_its_neighbour_where_they_touch(found):
     """Gland and tube lie apart; the gland's own surface, under another name, is touched everywhere."""
-    lines = found.minimum.evaluation.lines
+    lines = found.minimum.evaluation.linearisations
     gland, _, tube = (line.observation for line in lines)
     assert not tube.growth_error(lines[2].residuals, "gland", (gland, tube)).any()
     surface = replace(gland.target.surface, name="shell")

@@ -11,14 +11,7 @@ from scipy import sparse
 from scipy.spatial.distance import cdist
 
 from palpate.images.tissue import FieldPrior
-from palpate.inversion import (
-    InverseProblem,
-    LaterState,
-    invert,
-    material_blocks,
-    parameter_map,
-    unit_blocks,
-)
+from palpate.inversion import InverseProblem, LaterState, invert
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.neo_hookean import NeoHookean
@@ -27,6 +20,7 @@ from palpate.mechanics.material import MaterialModes, material_modes
 from palpate.mesh.locate import located, point_interpolation
 from palpate.observation import DataFile, DisplacementField, PointTable
 from palpate.uncertainty import NORMAL_95, sandwich_covariance, stiffness_maps
+from palpate.unknowns import material_blocks, parameter_map, unit_blocks
 
 PRIOR = FieldPrior(0.5, 6.0)
 SD_MM, LATTICE_MM = 0.02, 4.0

@@ -11,9 +11,9 @@ from typing import Any
 
 from palpate.cohort.plan import CASES, Plan, document_of
 from palpate.cohort.task import Outcome, Row
-from palpate.inversion import KNOWN_MODULUS
 from palpate.parallel import mapped
 from palpate.uncertainty import NORMAL_95
+from palpate.unknowns import KNOWN_MODULUS
 
 NEARLY = 0.95  # of that: a profile that comes so far has reached the end
 NOT_IMAGES = ("names", "mesh")  # inputs that two patients may well share

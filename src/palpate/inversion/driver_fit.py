@@ -8,18 +8,20 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation.contract import Approximation, LinearisationPoint
+from palpate.approximation.expansion import coarse_equilibrium, expansion_around
+from palpate.approximation.reduced_basis import reduced_basis
 from palpate.errors import NotConverged
-from palpate.inversion.approximation import Approximation, Place
-from palpate.inversion.evidence import with_learned_prior
-from palpate.inversion.expansion import coarse_equilibrium, expansion_around
+from palpate.inversion.hyper_parameters import with_amplitudes
 from palpate.inversion.later_state import InverseProblem
 from palpate.inversion.objective import Objective
-from palpate.inversion.optimise import Bounds, fit_coefficients
-from palpate.inversion.reduced_basis import reduced_basis
+from palpate.inversion.optimise import Bounds
+from palpate.inversion.trust_region import StopRule, begun, fit_coefficients, minimised
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.observation.noise_model import SEGMENTATION_NOISE
+from palpate.progress import silent
 
-DECREMENT = 1e-2  # of a fit that is the result itself
+FITTED = StopRule(step_sd=np.inf, coefficients=1e-3, model_error=np.inf, derivatives=False, learn=False)
 
 Motions = tuple[NDArray[np.float64], ...]
 
@@ -41,7 +43,7 @@ def fit_driver(
     first = []
     for state, basis, q in zip(problem.states, linear, amounts, strict=True):
         assert state.finite_strain is not None
-        coarse = coarse_equilibrium(state.finite_strain, basis, Place(moduli, q))
+        coarse = coarse_equilibrium(state.finite_strain, basis, LinearisationPoint(moduli, q))
         first.append(expansion_around(coarse, tolerance=ACCURACY))
     amounts = _fitted(held, first, np.concatenate(amounts))
     found = []
@@ -63,10 +65,9 @@ def _fitted(
     begin = np.concatenate([np.zeros(held.n_parameters), coefficients])
     bounds = Bounds(*np.outer([-1.0, 1.0], np.ones(held.n_parameters)))
     objective = held.under(models).with_observations([o.with_noise(SEGMENTATION_NOISE) for o in held.observations])
-    objective = objective.rematched(begin)
-    first = fit_coefficients(objective, begin, bounds=bounds, tolerance=DECREMENT)
-    objective = with_learned_prior(objective, first.evaluation, first.unknowns).rematched(first.unknowns)
-    found = fit_coefficients(objective, first.unknowns, bounds=bounds, tolerance=DECREMENT)
+    first = fit_coefficients(objective, begin, bounds=bounds)
+    objective = with_amplitudes(objective, first.evaluation, first.unknowns)
+    found = minimised(begun(objective, first.unknowns), bounds, FITTED, progress=silent, title="", fixed=True).minimum
     if not found.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
     return held.parameters.coefficients(found.unknowns)

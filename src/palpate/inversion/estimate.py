@@ -8,57 +8,62 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.errors import ConfigurationError, EstimationError, NotConverged
-from palpate.inversion.evidence import with_learned_prior
-from palpate.inversion.expansion import Expansion, coarse_equilibrium, expansion_around
+from palpate.inversion.frozen_posterior import fixed_correspondence, frozen_posterior
+from palpate.inversion.hyper_parameters import with_first_noise
 from palpate.inversion.informed_subspace import informed_problem
 from palpate.inversion.later_state import InverseProblem, LaterState
-from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.objective import AS_GOOD, Evaluation, Objective
 from palpate.inversion.optimise import (
-    TO_THE_NOISE,
+    Bounds,
     Iterate,
+    LeastSquares,
     Minimum,
     Outcome,
-    fit_coefficients,
     gauss_newton,
     same_minimum,
 )
-from palpate.inversion.outer_loop import (
-    Convergence,
-    InversionSettings,
-    OuterIterate,
-    StopRule,
-    minimised,
-    run_outer_loop,
-    updated,
-)
-from palpate.inversion.reweighting import with_first_noise, with_found_noise
+from palpate.inversion.trust_region import Convergence, OuterIterate, StopRule, begun, minimised
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
 from palpate.mechanics.forward import SolveCounts
 from palpate.parallel import blas_on_one_thread
-from palpate.progress import Progress, during
+from palpate.progress import Progress, during, silent
 
-OTHER = 1e-2  # decrement of minima that are compared: a two-hundredth of what tells them apart
-AS_GOOD = 1.92  # of minus the log-posterior: half the 95 % quantile of chi-squared with one degree of freedom
 REPORTED = StopRule()
-FIRST_GUESS = StopRule(
-    step_sd=0.5, model_error=np.inf, derivatives=False, solve_above=0.1, passes=1, iterations=1, far=np.inf
-)
-RELEASED = StopRule(step_sd=0.2, passes=2, iterations=5)  # an interval, to a tenth of its half-width
+CHEAP = StopRule(step_sd=0.3, floor=0.01)
+ELSEWHERE = replace(CHEAP, correlate=False)  # the numbers of independent residuals stay: objectives are compared
+FOLLOWED = 2  # minima of starts beside the first one, the best
+FIRST_GUESS = StopRule(step_sd=0.5, model_error=np.inf, derivatives=False)
+RELEASED = StopRule(step_sd=0.2)  # an interval, to a tenth of its half-width
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
 
 
 @dataclass(frozen=True, slots=True)
-class StartRun:
-    """What one start did on its own: log-moduli (n_parameters,) where it began, the minimum it found and the way there.
+class InversionSettings:
+    """Starts theta (n_parameters,) each, and their bounds; the first minimum is sought from the middle of `starts`."""
 
-    candidate: number of the distinct minimum that it leads to.
+    starts: tuple[NDArray[np.float64], ...]
+    bounds: Bounds
+    further: tuple[NDArray[np.float64], ...] = ()
+
+    @property
+    def every_start(self) -> tuple[NDArray[np.float64], ...]:
+        """All starts (n_parameters,), the further ones last."""
+        return self.starts + self.further
+
+
+@dataclass(frozen=True, slots=True)
+class StartRun:
+    """What one start did on the cheapest model: log-moduli (n_parameters,) where it began, and the minimum it found.
+
+    candidate: number of the minimum that it leads to, None where that was not followed, others being lower.
     """
 
     theta: NDArray[np.float64]
     minimum: Minimum
-    candidate: int
+    candidate: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,14 +153,15 @@ def first_noise_of(
 ) -> tuple[Objective, Minimum]:
     """What an estimate begins with under the linear law: the objective under the noise that the images show, and where.
 
-    Its minimum is near the middle start, and no estimate: no start, robust weight or exact derivative was tried. Raises
-    as `invert` does.
+    Its minimum is near the middle start, and no estimate: no other start and no exact derivative was tried. Raises as
+    `invert` does.
     """
     middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
     begin = np.concatenate([middle, np.zeros(problem.parameters.n_coefficients)])
     objective, unknowns, _ = _with_reduced_bases(problem.linear(), settings, begin, progress)
-    objective, _, _, nearby = _nearby(objective, unknowns, settings, progress)
-    return objective, nearby
+    objective = with_first_noise(objective).rematched(np.zeros(objective.parameters.n_unknowns))
+    nearby = minimised(begun(objective, unknowns), settings.bounds, CHEAP, progress=progress, title="the middle start")
+    return nearby.objective, nearby.minimum
 
 
 def continue_at_finite_strain(
@@ -178,7 +184,7 @@ def continue_at_finite_strain(
         try:
             progress("finite strain: the equilibrium at the linear estimate")
             start = [_expanded(*_coarse(waiting.pop(number)), minimum, progress)]
-            end = run_outer_loop(start.pop(), settings, rule, progress=progress, title="finite strain")
+            end = minimised(start.pop(), settings.bounds, rule, progress=progress, title="finite strain")
             progress("finite strain: the exact equilibrium at the estimate")
             ends[number] = end = _at_equilibrium(end, minimum.history)
             spent, evaluations = spent + end.counts, evaluations + end.minimum.evaluations
@@ -188,7 +194,8 @@ def continue_at_finite_strain(
             progress(f"finite strain: another minimum is left out: {error}")
             outcome = Outcome.NO_EQUILIBRIUM if isinstance(error, NotConverged) else Outcome.NOT_FOLLOWED
             ends[number] = replace(ends[linear.best], minimum=replace(minimum, outcome=outcome))
-    found = _concluded([ends[number] for number in sorted(ends)], linear.starts, linear.rest, settings, linear.best)
+    ended = [ends[number] for number in sorted(ends)]
+    found = _concluded(ended, linear.starts, linear.rest, settings.bounds, linear.best)
     return replace(found, evaluations=found.evaluations + evaluations, counts=spent)
 
 
@@ -207,7 +214,7 @@ def with_released(
         return None
     objective, evaluation = best.objective.released(best.minimum.evaluation, best.minimum.unknowns)
     start = replace(best, objective=objective, minimum=replace(best.minimum, evaluation=evaluation))
-    return run_outer_loop(start, settings, rule, progress=progress, title=f"with {' and '.join(causes)} free")
+    return minimised(start, settings.bounds, rule, progress=progress, title=f"with {' and '.join(causes)} free")
 
 
 def _with_reduced_bases(
@@ -234,83 +241,78 @@ def _linear(
     rule: StopRule,
     progress: Progress,
 ) -> Inversion:
-    """The estimate of the linear law: every start under the first noise model, the best one followed to its end.
+    """The estimate of the linear law: every start on the cheap model, the best ones followed to their ends.
 
-    begin (n_unknowns,): the middle start, with drivers' coefficients near the best ones there, and what it cost to find
-    them in evaluations.
+    begin (n_unknowns,): the middle start, with the blocks' coefficients near the best ones there, and what it cost to
+    find them in evaluations.
     """
-    objective, rest, fitted, nearby = _nearby(objective, begin, settings, progress)
-    n = objective.n_parameters
-    fitted, nearby = _remembered(fitted), _remembered(nearby)
-    minima = _from_starts(objective, settings, nearby.unknowns[n:], progress)
-    first = _best(minima)
-    start = [updated(objective, replace(minima[first], evaluations=0), rule)]
-    minima = [_remembered(minimum) for minimum in minima]
-    del objective  # and with it its approximations, which are large, when others take their place
-    followed = [run_outer_loop(start.pop(), settings, rule, progress=progress, title="linear law")]
-    found = followed[0].minimum.evaluation  # minima may lie apart under the first noise and be one under what was found
-    groups = _groups([replace(minimum, evaluation=found) for minimum in minima], n)
-    best = groups[first]
-    for group in dict.fromkeys(g for g in groups if g != best):
-        member = min((m for m, g in zip(minima, groups, strict=True) if g == group), key=lambda m: m.evaluation.value)
-        followed.append(_another(followed[0], member, settings, rule, progress))
-    order = [best, *dict.fromkeys(g for g in groups if g != best)]
-    triples = zip(settings.starts, minima, groups, strict=True)
-    starts = tuple(StartRun(theta, minimum, order.index(group)) for theta, minimum, group in triples)
-    evaluations += 1 + sum(m.evaluations for m in (fitted, nearby, *minima, *(f.minimum for f in followed)))
-    concluded = _concluded(followed, starts, rest, settings, 0)
-    of_first = followed[0].counts  # the others' approximations are this one's, extended
-    spent = sum((other.counts - of_first for other in followed[1:]), of_first)
-    return replace(concluded, evaluations=concluded.evaluations + evaluations, counts=spent)
-
-
-def _nearby(
-    objective: Objective, begin: NDArray[np.float64], settings: InversionSettings, progress: Progress
-) -> tuple[Objective, Evaluation, Minimum, Minimum]:
-    """The objective under the noise that images show near unknowns (n_unknowns,), and what it was found by.
-
-    That at no motion, the drivers' motion fitted at `begin`, and the minimum under the first noise.
-    """
-    still = np.zeros(objective.parameters.n_unknowns)
+    still, n, bounds = np.zeros(objective.parameters.n_unknowns), objective.n_parameters, settings.bounds
     objective = with_first_noise(objective).rematched(still)
     rest = objective(still)
-    fitted = fit_coefficients(objective, begin, bounds=settings.bounds, tolerance=TO_THE_NOISE)
-    objective = with_learned_prior(objective, fitted.evaluation, fitted.unknowns)
-    progress("the noise of the images, near the middle start")
-    nearby = gauss_newton(
-        objective.rematched(fitted.unknowns), fitted.unknowns, bounds=settings.bounds, tolerance=TO_THE_NOISE
+    first = minimised(begun(objective, begin), bounds, CHEAP, progress=progress, title="the middle start")
+    screened = _screened(first, settings, progress)
+    groups = _groups(screened, n)
+    ends, spent = [first], first.minimum.evaluations
+    belongs = {groups[i]: 0 for i, m in enumerate(screened) if same_minimum(m.unknowns, first.minimum, n)}
+    others = [min(_members(groups, g), key=lambda i: screened[i].evaluation.value) for g in dict.fromkeys(groups)]
+    others = sorted((i for i in others if groups[i] not in belongs), key=lambda i: screened[i].evaluation.value)
+    for number in [i for i in others if screened[i].converged][:FOLLOWED]:
+        start = begun(first.objective, screened[number].unknowns)
+        end = minimised(start, bounds, ELSEWHERE, progress=progress, title=f"start {number + 1}")
+        belongs[groups[number]], spent = len(ends), spent + end.minimum.evaluations
+        ends.append(end)
+    same = _groups([end.minimum for end in ends], n)
+    totals = [_total(end) for end in ends]
+    best = [min(_members(same, g), key=lambda i: totals[i]) for g in range(max(same) + 1)]
+    order = sorted(best, key=lambda i: totals[i])
+    followed = list[OuterIterate]()
+    for number in order:
+        if followed and not as_good(totals[number], totals[order[0]]):
+            followed.append(ends[number])
+            continue
+        start = replace(ends[number], minimum=replace(ends[number].minimum, evaluations=0))
+        followed.append(minimised(start, bounds, rule, progress=progress, title="linear law"))
+        spent += followed[-1].minimum.evaluations
+    place = {number: order.index(best[same[number]]) for number in range(len(ends))}
+    starts = tuple(
+        StartRun(theta, minimum, place[belongs[group]] if group in belongs else None)
+        for theta, minimum, group in zip(settings.every_start, screened, groups, strict=True)
     )
-    return with_found_noise(objective, nearby), rest, fitted, nearby
+    concluded = _concluded(followed, starts, rest, bounds, 0)
+    of_first = followed[0].counts
+    counts = sum((other.counts - of_first for other in followed[1:]), of_first)
+    evaluations += 1 + spent + concluded.evaluations
+    return replace(concluded, evaluations=evaluations, counts=counts)
 
 
-def _from_starts(
-    objective: Objective, settings: InversionSettings, coefficients: NDArray[np.float64], progress: Progress
-) -> list[Minimum]:
-    """A minimum from every start, the first with given coefficients (n_coefficients,), the others with its result."""
-    minima: list[Minimum] = []
-    for number, theta in enumerate(settings.starts, start=1):
-        begin = np.concatenate([theta, minima[0].unknowns[len(theta) :] if minima else coefficients])
-        found = minimised(objective, begin, settings, tolerance=None, known=minima)
-        minima.append(found)
-        progress(f"start {number} of {len(settings.starts)}: {len(found.history)} steps, {found.outcome.value}")
-    return minima
+def _screened(first: OuterIterate, settings: InversionSettings, progress: Progress) -> list[Minimum]:
+    """A minimum from every start on the cheapest model: closest points and hyper-parameters as at a first minimum.
 
-
-def _another(
-    best: OuterIterate, minimum: Minimum, settings: InversionSettings, rule: StopRule, progress: Progress
-) -> OuterIterate:
-    """Where another minimum ends under the best one's objective; followed on its own where it is lower there.
-
-    It begins with the drivers' coefficients of the best one, which the outer loop has refined.
+    Where that is no reduced model, on one that only has the former.
     """
-    n = best.objective.n_parameters
-    start = np.concatenate([minimum.unknowns[:n], best.minimum.unknowns[n:]])
-    found = minimised(best.objective, start, settings, tolerance=OTHER)
-    if found.converged and not as_good(best.minimum.evaluation.value, found.evaluation.value):
-        title = "linear law, another minimum"
-        end = run_outer_loop(updated(best.objective, found, rule), settings, rule, progress=progress, title=title)
-        return replace(end, checks=best.checks + end.checks)
-    return replace(best, minimum=found)
+    at, n = first.minimum, first.objective.n_parameters
+    progress(f"{len(settings.every_start)} starts, with the closest points of the first minimum")
+    try:
+        cheap: LeastSquares = frozen_posterior(first.objective, at.unknowns, at.evaluation)
+    except ConfigurationError:
+        cheap = fixed_correspondence(first.objective, at.unknowns, at.evaluation)
+    found = []
+    for theta in settings.every_start:
+        begin = np.concatenate([theta, at.unknowns[n:]])
+        found.append(gauss_newton(cheap, begin, bounds=settings.bounds, tolerance=AS_GOOD / 200.0))
+    return found
+
+
+def _members(groups: Sequence[int], group: int) -> list[int]:
+    """Numbers of those that belong to a group."""
+    return [i for i, of in enumerate(groups) if of == group]
+
+
+def _total(iterate: OuterIterate) -> float:
+    """The objective where an iterate ended; infinite where that is no minimum."""
+    if not iterate.minimum.converged:
+        return np.inf
+    return iterate.objective.total(iterate.minimum.evaluation)
 
 
 def _coarse(linear: OuterIterate) -> tuple[Objective, list[FiniteStrainEquilibrium]]:
@@ -318,7 +320,7 @@ def _coarse(linear: OuterIterate) -> tuple[Objective, list[FiniteStrainEquilibri
 
     Its states bend as the linear law does.
     """
-    before, places = linear.objective, linear.objective.places(linear.minimum.unknowns)
+    before, places = linear.objective, linear.objective.linearisation_points(linear.minimum.unknowns)
     found, states = list[FiniteStrainEquilibrium](), list[LaterState]()
     for state, basis, place in zip(before.states, before.approximations, places, strict=True):
         assert state.finite_strain is not None
@@ -333,13 +335,14 @@ def _expanded(
     """A linear minimum on expansions around the equilibria there."""
     first = [expansion_around(equilibrium, tolerance=EQUILIBRIUM, progress=progress) for equilibrium in coarse]
     objective = objective.under(first).rematched(minimum.unknowns)
-    return OuterIterate(objective, replace(minimum, evaluation=objective(minimum.unknowns), evaluations=1))
+    now = replace(minimum, evaluation=objective(minimum.unknowns), evaluations=1)
+    return OuterIterate(objective, now, exact=True)
 
 
 def _at_equilibrium(end: OuterIterate, before: tuple[Iterate, ...]) -> OuterIterate:
     """The end of an outer loop at exact equilibria; `before`: the way to where it began."""
     exact = []
-    places = end.objective.places(end.minimum.unknowns)
+    places = end.objective.linearisation_points(end.minimum.unknowns)
     for approximation, place in zip(end.objective.approximations, places, strict=True):
         assert isinstance(approximation, Expansion)
         exact.append(approximation.at_equilibrium(place, tolerance=ACCURACY))
@@ -353,7 +356,7 @@ def _concluded(
     followed: Sequence[OuterIterate],
     starts: tuple[StartRun, ...],
     rest: Evaluation,
-    settings: InversionSettings,
+    bounds: Bounds,
     first: int,
 ) -> Inversion:
     """The distinct ones of the iterates, compared with each other; `first`: the number of the one sought first."""
@@ -363,45 +366,30 @@ def _concluded(
     for group in range(max(groups) + 1):  # stood for by the one sought first, else one that converged
         members = [i for i, of in enumerate(groups) if of == group]
         distinct.append(followed[min(members, key=lambda i: (i != first, not followed[i].minimum.converged, i))])
-    values, evaluations = _values(distinct, settings)
+    values, evaluations = _values(distinct, bounds)
     candidates = tuple(Candidate(iterate, value) for iterate, value in zip(distinct, values, strict=True))
     usable = [c.value if c.minimum.converged else np.inf for c in candidates]
     best = int(np.argmin(usable)) if np.isfinite(usable).any() else groups[first]
-    joined = tuple(replace(start, candidate=groups[start.candidate]) for start in starts)
+    joined = tuple(s if s.candidate is None else replace(s, candidate=groups[s.candidate]) for s in starts)
     return Inversion(candidates, best, joined, rest, evaluations, SolveCounts())
 
 
-def _values(distinct: Sequence[OuterIterate], settings: InversionSettings) -> tuple[list[float], int]:
-    """The iterates' values under one objective, each at its minimum under that, and what it cost in evaluations.
+def _values(distinct: Sequence[OuterIterate], bounds: Bounds) -> tuple[list[float], int]:
+    """The objective at each iterate, hyper-parameters at their best, and what it cost in evaluations.
 
-    Each iterate has noise models, weights and a prior of its own, and a worse fit is a smaller value where the noise is
-    believed to be larger: all are compared under the objective of the one with the least noise, on their own
-    approximations. Least is the geometric mean of the observations' standard deviations: each of them counts as a
-    ratio, so that no kind decides by its unit or size. The evidence of each under its own objective is no way out: a
-    robust loss with its own cutoff is the logarithm of no density.
+    All with the numbers of independent residuals of the first that converged, which are data of an objective.
     """
     if len(distinct) == 1:
-        return [distinct[0].minimum.evaluation.value], 0
-    usable = [iterate for iterate in distinct if iterate.minimum.converged] or list(distinct)
-    reference = min(usable, key=lambda iterate: sum(np.log(o.noise_model.sd) for o in iterate.objective.observations))
+        return [distinct[0].objective.total(distinct[0].minimum.evaluation)], 0
+    reference = next((iterate for iterate in distinct if iterate.minimum.converged), distinct[0]).objective
     values, evaluations = [], 0
     for iterate in distinct:
-        unknowns = iterate.minimum.unknowns
-        same = reference.objective.under(iterate.objective.approximations).rematched(unknowns)
-        there = minimised(same, unknowns, settings, tolerance=OTHER)
-        values.append(there.evaluation.value)
-        evaluations += there.evaluations
+        pairs = zip(iterate.objective.observations, reference.observations, strict=True)
+        same = iterate.objective.with_observations([o.with_correlation(r.noise_model) for o, r in pairs])
+        end = minimised(begun(same, iterate.minimum.unknowns), bounds, ELSEWHERE, progress=silent, title="compared")
+        values.append(end.objective.total(end.minimum.evaluation))
+        evaluations += end.minimum.evaluations
     return values, evaluations
-
-
-def _remembered(minimum: Minimum) -> Minimum:
-    """The minimum without its residuals and their derivatives, which are large where many unknowns are seen."""
-    return replace(minimum, evaluation=replace(minimum.evaluation, lines=()))
-
-
-def _best(minima: Sequence[Minimum]) -> int:
-    """Number of the converged minimum with the smallest value; of them all when none converged."""
-    return min(range(len(minima)), key=lambda i: (not minima[i].converged, minima[i].evaluation.value))
 
 
 def _groups(minima: Sequence[Minimum], n_parameters: int) -> list[int]:

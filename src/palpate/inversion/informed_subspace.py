@@ -13,16 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from palpate.inversion.blocks import Acts, Block
+from palpate.approximation.reduced_basis import SNAPSHOT, ReducedBasis, basis_of
+from palpate.inversion.hyper_parameters import with_first_noise
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Objective
-from palpate.inversion.optimise import TO_THE_NOISE, Bounds, fit_coefficients
-from palpate.inversion.reduced_basis import SNAPSHOT, ReducedBasis, basis_of
-from palpate.inversion.reweighting import with_first_noise
+from palpate.inversion.optimise import Bounds
+from palpate.inversion.trust_region import fit_coefficients
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.progress import Progress
+from palpate.unknowns.blocks import Acts, Block
 
 SMALL = 12  # unknowns of a block, which are kept
 
@@ -58,7 +59,7 @@ def informed_problem(
         states.append(replace(state, observed=found[-1].seen(state, np.zeros(state.model.n_modes))))
     progress("the motion of walls and frame at the middle start")
     objective = with_first_noise(Objective(tuple(states), parameters)).rematched(begin)
-    fitted = fit_coefficients(objective, begin, bounds=bounds, tolerance=TO_THE_NOISE)
+    fitted = fit_coefficients(objective, begin, bounds=bounds)
     progress("what the images tell of all unknowns there")
     for s, (state, q) in enumerate(zip(objective.states, parameters.coefficients(fitted.unknowns), strict=True)):
         found[s] = found[s].with_material(q)

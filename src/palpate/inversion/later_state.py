@@ -9,14 +9,14 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation.contract import Approximation
 from palpate.errors import ConfigurationError
-from palpate.inversion.approximation import Approximation
-from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.linear_model import LinearModel
 from palpate.observation.contract import Float, Observation, OfMaterial, n_seen, seen_by
 from palpate.observation.noise_model import NoiseModel
+from palpate.unknowns.parameters import ParameterMap
 
 
 @dataclass(frozen=True, slots=True)

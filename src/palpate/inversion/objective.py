@@ -2,34 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
-from palpate.errors import EstimationError
-from palpate.inversion.approximation import Approximation, Derivatives, Place
+from palpate.approximation.contract import Approximation, Derivatives, LinearisationPoint, determined
 from palpate.inversion.later_state import LaterState
-from palpate.inversion.parameters import ParameterMap
 from palpate.mechanics.forward import Equilibrium
 from palpate.observation.contract import Observation, OfMaterial, Rematched, Residuals
 from palpate.observation.jacobian import Jacobian, jacobian_of
 from palpate.parallel import mapped
+from palpate.unknowns.parameters import ParameterMap
 
-
-@contextmanager
-def determined() -> Iterator[None]:
-    """Where images and prior leave an unknown open, its matrix has no inverse: raises `EstimationError` for it."""
-    try:
-        yield
-    except np.linalg.LinAlgError as error:
-        raise EstimationError(
-            f"the images do not determine what is sought ({error}): beside the noise ([noise] surface_sd_mm, or that of"
-            " the residuals) the driver's motion cannot be told from none; state the noise smaller, or use images in"
-            " which the organs move more"
-        ) from error
+DRIVER_LN_SD = float(np.log(2.0))  # of a driver's scale over that of its kind: how far its modes cannot follow it
+AS_GOOD = 1.92  # of minus the log posterior: half the 95 % quantile of chi-squared with one degree of freedom
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +58,7 @@ class Evaluation:
     gradient: NDArray[np.float64]
     score: NDArray[np.float64]
     matrix: NDArray[np.float64]
-    lines: tuple[Linearisation, ...]
+    linearisations: tuple[Linearisation, ...]
     prior: NDArray[np.float64]
     prior_score: NDArray[np.float64]
 
@@ -84,22 +73,60 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True)
 class Objective:
-    """J(x) = 1/2 sum_s precision_s sum_j w_j rho(r_j) + 1/2 (x - m)^T P (x - m) over all observations of all states.
+    """Minus the log posterior of unknowns x and hyper-parameters h, over all observations k of all later states.
 
-    The unknowns x, their prior mean m and precision P are those of `parameters`; rho: see `RobustLoss`. Each
-    observation has an offset, where `parameters` have one. prior_held: whether the blocks' prior stays what it is when
-    residuals are reweighted; last_held: whether that of the blocks that are learned last does.
+    J(x, h) = sum_k n_k sum_j w_j (rho_k(r_j) / (2 s_k^2) + ln Z_k(s_k)) + 1/2 (x - m)^T P (x - m) - 1/2 ln det P
+    - ln p(h) + 1/2 ln det H. The unknowns x, their prior mean m and precision P are those of `parameters`. h: the
+    scales s_k of the observations' `weighting`, the blocks' covariance P^-1, and the numbers of the alternatives
+    that are `chosen` for them, with their odds as p(h); the last term integrates over x by Laplace's approximation, H =
+    J^T W J + P. A call gives what depends on x at these h, `log_terms` the rest. Each observation has an offset, where
+    `parameters` have one. learn_last: whether the blocks that are learned last have a choice yet.
     """
 
     states: tuple[LaterState, ...]
     parameters: ParameterMap
-    prior_held: bool = False
-    last_held: bool = True
+    chosen: tuple[int | None, ...] = ()
+    learn_last: bool = False
 
     @property
     def n_parameters(self) -> int:
         """Number of log-moduli among the unknowns."""
         return self.parameters.n_parameters
+
+    def log_terms(self, evaluation: Evaluation) -> float:
+        """What J has beside an evaluation's value: ln Z of the residuals, ln det P, ln p(h), ln det H."""
+        pairs = zip(self.parameters.blocks, self.chosen, strict=False)
+        odds = [block.odds[c] for block, c in pairs if block.odds and c is not None]
+        residuals = sum(o.weighting.log_normaliser for o in self.observations)
+        for state in self.states:
+            kinds = {o.kind: o.weighting.sd for o in state.observations if not o.of_driver}
+            drivers = [o for o in state.observations if o.of_driver and o.kind in kinds]
+            residuals += sum(worse_driver(o.weighting.sd, kinds[o.kind]) for o in drivers)
+        normal, beyond = self.as_normal(evaluation)
+        n = self.n_parameters
+        determinants = log_det(evaluation.matrix - evaluation.prior + normal) - log_det(normal[n:, n:])
+        return residuals + beyond - sum(odds) + 0.5 * determinants
+
+    def as_normal(self, evaluation: Evaluation) -> tuple[NDArray[np.float64], float]:
+        """Precision P (n_unknowns, n_unknowns) for the determinants; what J has beside the normal laws of `parameters`.
+
+        A total variation counts as it is where it was evaluated, and in the determinants as the normal law with which
+        it begins: its curvature has edges, which no smooth function of x follows.
+        """
+        normal, beyond = evaluation.prior, 0.0
+        for i, block in enumerate(self.parameters.blocks):
+            if block.variation:
+                own = self.parameters.columns(i)
+                away = linalg.solve(normal[np.ix_(own, own)], evaluation.prior_score[own], assume_a="pos")
+                x = self.parameters.prior_centre[own] + away
+                beyond += block.variation.value(x) - 0.5 * float(away @ evaluation.prior_score[own])
+                normal = normal.copy()
+                normal[np.ix_(own, own)] = block.precision
+        return normal, beyond
+
+    def total(self, evaluation: Evaluation) -> float:
+        """J, dimensionless, where it was evaluated."""
+        return evaluation.value + self.log_terms(evaluation)
 
     @property
     def observations(self) -> list[Observation]:
@@ -113,19 +140,22 @@ class Objective:
         assert len(found) == len(self.states), "an objective is made of states with approximations"
         return found
 
-    def places(
-        self, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, worth: Derivatives = Derivatives.KEPT
-    ) -> list[Place]:
+    def linearisation_points(
+        self,
+        unknowns: NDArray[np.float64],
+        evaluation: Evaluation | None = None,
+        derivatives: Derivatives = Derivatives.KEPT,
+    ) -> list[LinearisationPoint]:
         """What unknowns (n_unknowns,) mean for each state; by an `evaluation` with the directions that decide there."""
         mapping = self.parameters
         moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
         if evaluation is None:
-            return [Place(moduli, q) for q in coefficients]
+            return [LinearisationPoint(moduli, q) for q in coefficients]
         directions, places = deciding_directions(evaluation, mapping.n_parameters), []
         for s, q in enumerate(coefficients):
             own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
             metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
-            places.append(Place(moduli, q, chain @ directions[own], metric, worth))
+            places.append(LinearisationPoint(moduli, q, chain @ directions[own], metric, derivatives))
         return places
 
     def under(self, approximations: Sequence[Approximation]) -> Objective:
@@ -283,12 +313,14 @@ class LinearisedObjective:
     """An objective with the residuals linear around unknowns (n_unknowns,) where it was evaluated.
 
     No displacement and no closest point is sought: a value costs a hundredth. `objective` says how much each residual
-    counts; its observations may be reweighted ones of those that were evaluated.
+    counts; its hyper-parameters may be others than those of the evaluation. damping: mu, 1/2 mu d^T diag(H) d of the
+    step d is added (Levenberg and Marquardt).
     """
 
     objective: Objective
     unknowns: NDArray[np.float64]
     evaluation: Evaluation
+    damping: float = 0.0
 
     @property
     def n_parameters(self) -> int:
@@ -303,13 +335,24 @@ class LinearisedObjective:
             """One observation's residuals with their derivative."""
             observation, known = of
             values = known.residuals.values + known.jacobian.times(step[known.columns])
-            residuals = replace(known.residuals, values=values)
+            residuals = observation.weighed(replace(known.residuals, values=values))
             weights = residuals.weights * observation.weighting.loss.weight(values)
             gradient = known.jacobian.transposed_times(observation.weighting.precision * weights * values)
             return replace(known, observation=observation, residuals=residuals, weights=weights, gradient=gradient)
 
-        lines = mapped(line, zip(self.objective.observations, self.evaluation.lines, strict=True))
-        return self.objective.assembled(unknowns, lines)
+        lines = mapped(line, zip(self.objective.observations, self.evaluation.linearisations, strict=True))
+        found = self.objective.assembled(unknowns, lines)
+        if not self.damping:
+            return found
+        ridge = self.damping * np.diag(self.evaluation.matrix)
+        value, pull = found.value + 0.5 * float(step @ (ridge * step)), ridge * step
+        return replace(
+            found,
+            value=value,
+            gradient=found.gradient + pull,
+            score=found.score + pull,
+            matrix=found.matrix + np.diag(ridge),
+        )
 
 
 def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np.float64]:
@@ -328,6 +371,17 @@ def _normal_equations(line: Linearisation) -> tuple[NDArray[np.float64], NDArray
     """J^T W r (n_columns,) and J^T W J (n_columns, n_columns) of one observation."""
     weights = line.precision * line.weights
     return line.jacobian.transposed_times(weights * line.residuals.values), line.jacobian.gram(weights)
+
+
+def worse_driver(sd: float, kind_sd: float) -> float:
+    """Minus the log prior of a driver's scale: as that of its kind, or larger, by a factor of 2 seldom."""
+    return 0.5 * (max(float(np.log(sd / kind_sd)), 0.0) / DRIVER_LN_SD) ** 2
+
+
+def log_det(matrix: NDArray[np.float64]) -> float:
+    """Ln det of a positive definite matrix (n, n), without the unknowns that nothing depends on."""
+    seen = np.diag(matrix) > 0.0
+    return float(np.linalg.slogdet(matrix[np.ix_(seen, seen)])[1]) if seen.any() else 0.0
 
 
 def _misfit(observation: Observation, residuals: Residuals) -> float:

@@ -1,32 +1,23 @@
-"""Minima of an objective over all unknowns: Gauss-Newton with a trust region on the log-moduli, or L-BFGS-B."""
+"""Minima of a smooth least-squares objective over all unknowns: Gauss-Newton with a trust region on the log-moduli."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 
 from palpate.errors import SolverError
-from palpate.inversion.objective import Evaluation, Objective, determined
+from palpate.inversion.objective import Evaluation
 
 AT_BOUND = 1e-6  # of ln E
-FIRST_RADIUS = 1.0  # of the log-moduli, per step: a factor e
-MAX_RADIUS = 2.0
-LEAST_DAMPING = 1e-2  # of the diagonal: less is nearly the step that was refused
-SEARCHES = 8  # trials of a step
+RADIUS = 2.0  # of the log-moduli, the largest of a step; a first one has half of it
+LEAST_DAMPING = 0.1  # of the diagonal: less is nearly the step that was refused
+BAD, GOOD = 0.25, 0.75  # shares of the reduction that is promised (Nocedal & Wright 2006, Algorithm 4.1)
+TRIALS = 12  # of a step
 SAME_MINIMUM = 0.02  # of ln E: minima no further apart are one
-SAME_SD = 1.0  # posterior standard deviations, too: two normal densities up to two apart have one mode together
-MET = 0.5  # decrement (log-likelihood) from which an iterate knows where it is going to end
-WORTH = 1e-2  # units of log-likelihood that a damped step must promise to be tried
-SLIDING = 0.02  # decrement a driver's coefficient, a fifth of its sd: below it walls slide from voxel to voxel
-SLIDING_SD = 0.1  # posterior standard deviations of a log-modulus, which are left while they do
-CIRCLING = 4  # steps without a smaller decrement, after which those within the noise go round in circles
-STALLED = 0.03  # decrement, a quarter of a posterior width, under which a refused step is the noise of closest points
 
 
 class LeastSquares(Protocol):
@@ -46,8 +37,6 @@ class Outcome(StrEnum):
     """How an iteration ended; the value is the sentence that the user reads."""
 
     CONVERGED = "the decrement fell under its tolerance"
-    JOINED = "it reached a minimum that another start had found"
-    STALLED = "no smaller value was found within a quarter of the posterior's width"
     STEPS = "the iteration reached its largest number of steps; raise it, or start nearer"
     STUCK = "no step reduced the objective; look at the fit of the driver's surface and at the images"
     UNSOLVABLE = "every shorter step led where the model cannot be solved, as where it turns elements inside out"
@@ -58,7 +47,7 @@ class Outcome(StrEnum):
     @property
     def converged(self) -> bool:
         """Whether the point reached is a minimum."""
-        return self in (Outcome.CONVERGED, Outcome.JOINED, Outcome.STALLED)
+        return self is Outcome.CONVERGED
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,61 +94,52 @@ class Minimum:
 
 
 @dataclass(frozen=True, slots=True)
-class ShareOfValue:
-    """A tolerance of the decrement that grows with the objective: its residuals are then as large as they will be."""
+class TrustRegion:
+    """The largest step of a log-modulus, and Levenberg-Marquardt damping of all unknowns relative to the diagonal."""
 
-    share: float
-
-
-TO_THE_NOISE = ShareOfValue(0.1)  # what is left of it is the noise, to so much of its variance
-
-
-@dataclass(frozen=True, slots=True)
-class _Region:
-    """Trust region: radius of theta, and Levenberg-Marquardt damping of all unknowns relative to the diagonal."""
-
-    radius: float = FIRST_RADIUS
+    radius: float = 0.5 * RADIUS
     damping: float = 0.0
 
-    def smaller(self) -> _Region:
-        """After a step that was refused."""
-        return _Region(self.radius / 3.0, max(10.0 * self.damping, LEAST_DAMPING))
+    def smaller(self, longest: float) -> TrustRegion:
+        """After a step that was refused, whose `longest` log-modulus is known.
 
-    def larger(self) -> _Region:
-        """After a step that brought what it promised."""
-        return _Region(min(2.0 * self.radius, MAX_RADIUS), self.damping / 10.0 if self.damping > LEAST_DAMPING else 0.0)
+        It is damped only where no log-modulus is left to be shortened: damping all unknowns ends a step along a valley.
+        """
+        damping = self.damping if longest > SAME_MINIMUM else max(4.0 * self.damping, LEAST_DAMPING)
+        return TrustRegion(0.5 * min(self.radius, longest), damping)
+
+    def after(self, share: float, longest: float, *, grows: bool = True) -> TrustRegion:
+        """After a step that was taken, which brought a `share` of what it promised."""
+        damping = self.damping / 4.0 if self.damping > LEAST_DAMPING else 0.0
+        if share < BAD:
+            return TrustRegion(0.5 * min(self.radius, longest), damping)
+        return TrustRegion(min(2.0 * self.radius, RADIUS) if share > GOOD and grows else self.radius, damping)
 
 
-WHOLE = _Region(np.inf, 0.0)  # the step to the minimum of the quadratic model
+WHOLE = TrustRegion(np.inf, 0.0)  # the step to the minimum of the quadratic model
 
 
 def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
     """Standard deviations (n_parameters,) of the log-moduli by the Gauss-Newton matrix.
 
-    Raises `EstimationError` where neither images nor prior determine some unknown.
+    Infinite where a modulus moves nothing, as in a body at rest. Raises `EstimationError` where neither images nor
+    prior determine some other unknown.
     """
-    return np.asarray(np.sqrt(np.diag(minimum.evaluation.covariance_columns(n_parameters))))
+    evaluation, sd = minimum.evaluation, np.full(n_parameters, np.inf)
+    seen = np.diag(evaluation.matrix) > 0.0
+    kept = seen[:n_parameters]
+    own = evaluation if seen.all() else replace(evaluation, matrix=evaluation.matrix[np.ix_(seen, seen)])
+    sd[kept] = np.sqrt(np.diag(own.covariance_columns(int(kept.sum()))))
+    return sd
 
 
 def same_minimum(unknowns: NDArray[np.float64], minimum: Minimum, n_parameters: int) -> bool:
-    """Whether unknowns (n_unknowns,) lie so near a minimum that both are one."""
-    width = np.maximum(SAME_MINIMUM, SAME_SD * posterior_sd(minimum, n_parameters))
-    return bool(np.all(np.abs(unknowns - minimum.unknowns)[:n_parameters] < width))
+    """Whether unknowns (n_unknowns,) lie so near a minimum that both are one: within a posterior standard deviation.
 
-
-def fit_coefficients(
-    objective: Objective,
-    begin: NDArray[np.float64],
-    *,
-    bounds: Bounds,
-    tolerance: float | ShareOfValue | None = None,
-    max_steps: int = 40,
-) -> Minimum:
-    """The best driver coefficients at the log-moduli of `begin` (n_unknowns,), sought from there.
-
-    To a decrement of `tolerance`, by default to where walls slide; they are left where they are after `max_steps`.
+    Two normal densities up to two apart have one mode together.
     """
-    return gauss_newton(objective, begin, bounds=bounds, held=True, tolerance=tolerance, max_steps=max_steps)
+    width = np.maximum(SAME_MINIMUM, posterior_sd(minimum, n_parameters))
+    return bool(np.all(np.abs(unknowns - minimum.unknowns)[:n_parameters] < width))
 
 
 def gauss_newton(
@@ -167,58 +147,36 @@ def gauss_newton(
     start: NDArray[np.float64],
     *,
     bounds: Bounds,
-    held: NDArray[np.bool_] | bool = False,
-    tolerance: float | ShareOfValue | None = 1e-3,
+    fixed: NDArray[np.bool_] | bool = False,
+    tolerance: float = 1e-3,
     within: NDArray[np.float64] | float = np.inf,
-    known: Sequence[Minimum] = (),
     max_steps: int = 40,
 ) -> Minimum:
     """Minimise `objective` from `start` (n_unknowns,).
 
     Step: (J^T W J + P + mu D) d = -s, s the score, with the log-moduli's part no longer than the trust radius; a step
-    is taken when it reduces the objective (Nocedal & Wright 2006, Algorithm 4.1) or lowers by a tenth the decrement
-    -s.d / 2, the reduction that the quadratic model still promises in units of log-likelihood. It ends when that is
-    under `tolerance` and the step to the model's minimum moves each log-modulus by less than `within` (one number, or
-    (n_parameters,)), or where steps within the noise of closest points lower the decrement no more: then where that was
-    least; or where it is about to meet one of the `known` minima. `held`: which log-moduli (n_parameters,) keep their
-    values, or whether all do. A tolerance of None: to where drivers' walls slide from voxel to voxel and the log-moduli
-    are within a tenth of their posterior standard deviations, which serves where the objective is going to change.
+    is taken when it reduces the objective (Nocedal & Wright 2006, Algorithm 4.1). It ends when the decrement -s.d / 2,
+    the reduction that the quadratic model still promises in units of log-likelihood, is under `tolerance` and the step
+    to the model's minimum moves each log-modulus by less than `within` (one number, or (n_parameters,)). `fixed`: which
+    log-moduli (n_parameters,) keep their values, or whether all do.
     """
-    unknowns, region, history, n = start.copy(), _Region(), list[Iterate](), objective.n_parameters
-    sliding = SLIDING * (len(start) - n)
+    unknowns, region, history, n = start.copy(), TrustRegion(), list[Iterate](), objective.n_parameters
     now, evaluations, outcome = objective(unknowns), 1, Outcome.STEPS
-    nearest, least, since = (unknowns, now), np.inf, 0
     for _ in range(max_steps):
         if not np.isfinite(now.value):
             outcome = Outcome.NOT_FINITE
             break
-        free = _free(objective, unknowns, now, bounds, held)
+        free = _free(objective, unknowns, now, bounds, fixed)
         decrement = newton_decrement(now, free)
         history.append(Iterate(unknowns[:n], now.value, now.misfit_mm2, decrement))
-        to_end = _step(now, free, n, WHOLE)
-        whole = to_end[:n]
-        if tolerance is None and decrement < sliding and held is not True:
-            within = SLIDING_SD * np.sqrt(np.diag(now.covariance_columns(n)))
-        small = sliding if tolerance is None else tolerance
-        if isinstance(small, ShareOfValue):
-            small = max(sliding, 0.0 if _at_rest(unknowns[n:]) else small.share * now.value)
-        if decrement < small and np.all(np.abs(whole) < within):
+        if decrement < tolerance and np.all(np.abs(_step(now, free, n, WHOLE)[:n]) < within):
             outcome = Outcome.CONVERGED
-            break
-        if decrement < MET and any(same_minimum(unknowns + to_end, other, n) for other in known):
-            outcome = Outcome.JOINED
-            break
-        since += 1
-        if decrement < 0.9 * least:
-            nearest, least, since = (unknowns, now), decrement, 0
-        if since >= CIRCLING and _within_noise(now, free, whole, decrement):
-            (unknowns, now), outcome = nearest, Outcome.STALLED
             break
         found, trials, solved = _search(objective, unknowns, now, free=free, bounds=bounds, region=region)
         evaluations += trials
         if found is None:
-            near = decrement < STALLED or _within_noise(now, free, whole, decrement)
-            outcome = Outcome.STALLED if near else Outcome.STUCK if solved else Outcome.UNSOLVABLE
+            near = decrement < tolerance
+            outcome = Outcome.CONVERGED if near else Outcome.STUCK if solved else Outcome.UNSOLVABLE
             break
         unknowns, now, region = found
     return Minimum(unknowns, now, outcome, tuple(history), evaluations)
@@ -231,39 +189,27 @@ def _search(
     *,
     free: NDArray[np.bool_],
     bounds: Bounds,
-    region: _Region,
-) -> tuple[tuple[NDArray[np.float64], Evaluation, _Region] | None, int, bool]:
-    """First step that makes progress, with the region for the next, or None; the trials; whether any was solved.
-
-    After a refusal only steps are tried that promise a reduction of more than `WORTH`: less is the noise of re-chosen
-    closest points.
-    """
-    n = objective.n_parameters
-    before, solved = newton_decrement(now, free), False
-    for trials in range(SEARCHES):
+    region: TrustRegion,
+) -> tuple[tuple[NDArray[np.float64], Evaluation, TrustRegion] | None, int, bool]:
+    """First step that reduces the objective, with the next region, or None; the trials; whether any was solved."""
+    n, solved = objective.n_parameters, False
+    for trials in range(TRIALS):
         trial = unknowns + _step(now, free, n, region)
         trial[:n] = np.clip(trial[:n], bounds.lower, bounds.upper)
         step = trial - unknowns
+        longest = float(np.abs(step[:n]).max(initial=0.0))
         promised = -now.score @ step - 0.5 * step @ now.matrix @ step
-        if trials and promised < WORTH:
-            return None, trials, solved
         try:
             there = objective(trial)
         except SolverError:  # no law answers where elements are turned inside out
-            region = region.smaller()
+            region = region.smaller(longest)
             continue
         solved = True
         gain = now.value - there.value
-        progress = gain > 1e-4 * promised or newton_decrement(there, free) < 0.9 * before
-        if promised > 0.0 and progress:  # what a bound leaves of a step may lead uphill
-            return (trial, there, region.larger() if gain > 0.25 * promised else region), trials + 1, True
-        region = region.smaller()
-    return None, SEARCHES, solved
-
-
-def _at_rest(coefficients: NDArray[np.float64]) -> bool:
-    """Whether the drivers (n_coefficients,) have not moved yet: no modulus shows, and no residual is the noise."""
-    return len(coefficients) > 0 and not np.any(coefficients)
+        if promised > 0.0 and gain > 1e-4 * promised:  # what a bound leaves of a step may lead uphill
+            return (trial, there, region.after(float(gain / promised), longest)), trials + 1, True
+        region = region.smaller(longest)
+    return None, TRIALS, solved
 
 
 def _free(
@@ -271,12 +217,12 @@ def _free(
     unknowns: NDArray[np.float64],
     now: Evaluation,
     bounds: Bounds,
-    held: NDArray[np.bool_] | bool,
+    fixed: NDArray[np.bool_] | bool,
 ) -> NDArray[np.bool_]:
-    """Unknowns that may move: not a log-modulus at a bound that pulls outwards, nor a held one."""
+    """Unknowns that may move: not a log-modulus at a bound that pulls outwards, nor a fixed one."""
     n = objective.n_parameters
     theta, slope = unknowns[:n], now.score[:n]
-    still = ((theta <= bounds.lower) & (slope > 0.0)) | ((theta >= bounds.upper) & (slope < 0.0)) | held
+    still = ((theta <= bounds.lower) & (slope > 0.0)) | ((theta >= bounds.upper) & (slope < 0.0)) | fixed
     return np.concatenate([~still, np.ones(len(unknowns) - n, dtype=bool)])
 
 
@@ -286,21 +232,7 @@ def newton_decrement(now: Evaluation, free: NDArray[np.bool_] | slice = slice(No
     return float(0.5 * score @ _solve(matrix, score))
 
 
-def _within_noise(now: Evaluation, free: NDArray[np.bool_], step: NDArray[np.float64], decrement: float) -> bool:
-    """Whether the step (n_parameters,) that finds no smaller value is the noise of re-chosen closest points.
-
-    It moves every free log-modulus by less than a tenth of its posterior width, and promises less than a thousandth of
-    the objective (a hundredth where the moduli are held and only the driver moves).
-    """
-    moving = free[: len(step)]
-    with determined():
-        inverse = np.linalg.inv(now.matrix[np.ix_(free, free)])
-    width = np.sqrt(np.diag(inverse)[: int(moving.sum())])
-    share = 1e-3 if moving.any() else 1e-2
-    return bool(np.all(np.abs(step[moving]) < 0.1 * width)) and decrement < share * now.value + STALLED
-
-
-def _step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int, region: _Region) -> NDArray[np.float64]:
+def _step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int, region: TrustRegion) -> NDArray[np.float64]:
     """Damped Gauss-Newton step (n,) whose log-moduli stay within the radius."""
     matrix = now.matrix + region.damping * np.diag(np.diag(now.matrix))
     ridge = np.diag(np.where(np.arange(len(free)) < n_parameters, np.diag(now.matrix), 0.0))
@@ -320,48 +252,3 @@ def _solve(matrix: NDArray[np.float64], rhs: NDArray[np.float64]) -> NDArray[np.
     scaled = scale[:, None] * matrix * scale
     scaled[np.diag_indices_from(scaled)] += 1e-12
     return np.asarray(scale * np.linalg.solve(scaled, scale * rhs))
-
-
-def lbfgs(
-    objective: Objective, start: NDArray[np.float64], *, bounds: Bounds, tolerance: float = 1e-4, max_steps: int = 60
-) -> Minimum:
-    """Minimise min_q J(theta, q) over theta from `start` (n_unknowns,) with L-BFGS-B (Byrd et al. 1995).
-
-    Its gradient is dJ/dtheta at the best q (envelope theorem). It ends when the projected gradient, scaled by the
-    curvature at the start, falls under the square root of `tolerance`.
-    """
-    n = objective.n_parameters
-    first = gauss_newton(objective, start, bounds=bounds, held=True, tolerance=tolerance)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(first.evaluation.matrix)[:n], 1e-30))
-    profile = dict[bytes, Minimum]()  # of pure answers: what was asked before changes none
-
-    def at(scaled: NDArray[np.float64]) -> Minimum:
-        """The best coefficients at scaled log-moduli (n_parameters,), sought from those of the start."""
-        key = scaled.tobytes()
-        if key not in profile:
-            unknowns = np.concatenate([scaled * scale, first.unknowns[n:]])
-            profile[key] = gauss_newton(objective, unknowns, bounds=bounds, held=True, tolerance=tolerance)
-        return profile[key]
-
-    def value_and_slope(scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """min_q J and its slope (n_parameters,) by the scaled log-moduli (n_parameters,)."""
-        now = at(scaled).evaluation
-        return now.value, now.gradient[:n] * scale
-
-    found = optimize.minimize(
-        value_and_slope,
-        start[:n] / scale,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=optimize.Bounds(bounds.lower / scale, bounds.upper / scale),
-        options={"maxiter": max_steps, "ftol": 1e-14, "gtol": float(np.sqrt(tolerance))},
-    )
-    best = at(found.x)
-    history = []
-    for minimum in [*profile.values(), best]:  # half of the squared scaled slope stands for the decrement
-        now, slope = minimum.evaluation, minimum.evaluation.gradient[:n] * scale
-        history.append(Iterate(minimum.unknowns[:n], now.value, now.misfit_mm2, float(0.5 * slope @ slope)))
-    small = history[-1].decrement < 100.0 * tolerance
-    outcome = Outcome.CONVERGED if found.success else Outcome.STALLED if small else Outcome.STEPS
-    evaluations = first.evaluations + sum(minimum.evaluations for minimum in profile.values())
-    return Minimum(best.unknowns, best.evaluation, outcome, tuple(history), evaluations)

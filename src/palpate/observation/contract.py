@@ -50,6 +50,7 @@ class Residuals:
     smooth_jacobian: the same without what only image noise makes of it (that of the exact one where there is no such
     thing). distances (m,) mm: of what is compared, where the residuals are not these themselves. direct (n, n_regions +
     n_material): their derivatives by ln E and the material's coefficients at a held displacement, where they have any.
+    shares (n,): weights by area alone, where the noise model changes them.
     """
 
     values: NDArray[np.float64]
@@ -61,14 +62,29 @@ class Residuals:
     smooth_jacobian: sparse.csr_matrix[np.float64]
     distances: NDArray[np.float64] | None = None
     direct: NDArray[np.float64] | None = None
+    shares: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Weighting:
-    """How residuals count in the objective: 1/2 precision sum_j w_j rho(r_j), `precision` in mm^-2, rho the `loss`."""
+    """How residuals count: n sum_j w_j (rho(r_j) / (2 s^2) + ln Z(s)), minus the logarithm of their density.
+
+    precision: n / s^2 (mm^-2) with the scale s; rho, Z: of the `loss`; count: n, the number of independent residuals.
+    """
 
     precision: float
     loss: RobustLoss
+    count: float = 1.0
+
+    @property
+    def sd(self) -> float:
+        """The scale s, mm."""
+        return float(np.sqrt(self.count / self.precision))
+
+    @property
+    def log_normaliser(self) -> float:
+        """N ln Z(s)."""
+        return self.count * self.loss.log_normaliser(self.sd)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,11 +163,21 @@ class Observation(Protocol):
         """The same with all its residuals counting by a noise model."""
         ...
 
-    def reweighted(self, residuals: Residuals, beyond_modes: NDArray[np.float64] | None = None) -> Self:
-        """The same with a robust loss that its residuals tell, under its noise model.
+    @property
+    def sd_bounds(self) -> tuple[float, float]:
+        """Between which the scale of its residuals is sought; equal where that is known."""
+        ...
 
-        beyond_modes (n,) mm: of a driver's residuals what no motion of its modes takes away; None: all of them.
-        """
+    def with_sd(self, sd: float) -> Self:
+        """The same with another scale of its residuals, and outliers by that."""
+        ...
+
+    def with_correlation(self, noise: NoiseModel) -> Self:
+        """The same, its number of independent residuals by a noise model, the scale kept."""
+        ...
+
+    def weighed(self, residuals: Residuals) -> Residuals:
+        """The same residuals with the weights that they have under the noise model."""
         ...
 
     def first_noise(self, peers: Sequence[Self]) -> NoiseModel:

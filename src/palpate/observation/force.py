@@ -16,7 +16,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.contract import DataFile, Fit, Reaction, ReactionOf, Residuals, Weighting
 from palpate.observation.noise_model import FitResponse, NoiseModel
-from palpate.observation.robust_loss import Tukey
+from palpate.observation.robust_loss import PowerLaw
 
 ALONE = 1e-3  # mm: no other residual is alike
 
@@ -102,12 +102,24 @@ class Force:
 
     def with_noise(self, noise: NoiseModel) -> Force:
         """The same, counting by the variance of the noise."""
-        return replace(self, noise_model=noise, weighting=Weighting(1.0 / noise.sd**2, Tukey()))
+        return replace(self, noise_model=noise, weighting=Weighting(1.0 / noise.sd**2, PowerLaw()))
 
-    def reweighted(self, residuals: Residuals, beyond_modes: NDArray[np.float64] | None = None) -> Force:
-        """The same: there is no second force that would tell of an outlier."""
-        del residuals, beyond_modes
-        return self
+    @property
+    def sd_bounds(self) -> tuple[float, float]:
+        """What is stated: there is no second force that would tell more."""
+        return self.stated.sd, self.stated.sd
+
+    def with_sd(self, sd: float) -> Force:
+        """The same, counting by another standard deviation."""
+        return replace(self, weighting=Weighting(1.0 / sd**2, PowerLaw()))
+
+    def with_correlation(self, noise: NoiseModel) -> Force:
+        """The same noise: it is one residual."""
+        return replace(self, noise_model=noise)
+
+    def weighed(self, residuals: Residuals) -> Residuals:
+        """The same: it is one residual."""
+        return residuals
 
     def first_noise(self, peers: Sequence[Force]) -> NoiseModel:
         """What is stated."""
@@ -162,7 +174,7 @@ class ForceMeasurement:
             file.force_n,
             stated,
             stated,
-            Weighting(1.0 / file.sd_n**2, Tukey()),
+            Weighting(1.0 / file.sd_n**2, PowerLaw()),
             offset_sd=file.offset_sd_n,
         )
         return term, ()

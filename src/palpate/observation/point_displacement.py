@@ -13,9 +13,9 @@ from palpate.mesh.locate import Places, point_interpolation
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.contract import DataFile, Fit, PointMotions, Residuals, Weighting
 from palpate.observation.noise_model import FitResponse, NoiseModel, whitener
-from palpate.observation.robust_loss import Tukey
+from palpate.observation.robust_loss import PowerLaw
 
-TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
+FAR = 3.0  # cutoff in standard deviations, 99 % efficient for normal errors
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
 ALONE = 1e-3  # mm: length over which errors that are independent are alike
 FEW = 30  # residuals, of which a spread is not told
@@ -71,13 +71,26 @@ class PointDisplacement:
 
     def with_noise(self, noise: NoiseModel) -> PointDisplacement:
         """All points count, by the variance of the noise."""
-        return replace(self, noise_model=noise, weighting=Weighting(len(self.measured) / noise.sd**2, Tukey()))
+        n = float(len(self.measured))
+        return replace(self, noise_model=noise, weighting=Weighting(n / noise.sd**2, PowerLaw(), n))
 
-    def reweighted(self, residuals: Residuals, beyond_modes: NDArray[np.float64] | None = None) -> PointDisplacement:
-        """The same with Tukey's loss: a point that was mistaken for another counts less, or not at all."""
-        del beyond_modes
-        spread = max(MAD * float(np.median(np.abs(residuals.values))), self.noise_model.sd)
-        return replace(self, weighting=Weighting(self.weighting.precision, Tukey(TUKEY * spread)))
+    @property
+    def sd_bounds(self) -> tuple[float, float]:
+        """From what is stated on."""
+        return self.stated.sd, np.inf if len(self.measured) >= FEW else self.stated.sd
+
+    def with_sd(self, sd: float) -> PointDisplacement:
+        """The same; a point that was mistaken for another counts less, the further off it is."""
+        n = self.weighting.count
+        return replace(self, weighting=Weighting(n / sd**2, PowerLaw(FAR * sd), n))
+
+    def with_correlation(self, noise: NoiseModel) -> PointDisplacement:
+        """The same noise: its residuals are independent."""
+        return replace(self, noise_model=noise)
+
+    def weighed(self, residuals: Residuals) -> Residuals:
+        """The same: every residual counts alike."""
+        return residuals
 
     def first_noise(self, peers: Sequence[PointDisplacement]) -> NoiseModel:
         """What is stated."""
@@ -134,7 +147,7 @@ def point_displacement(
         observed_share=1.0,
         stated=stated,
         noise_model=stated,
-        weighting=Weighting(3 * n / file.sd_mm**2, Tukey()),
+        weighting=Weighting(3.0 * n / file.sd_mm**2, PowerLaw(), 3.0 * n),
         labels=labels,
     )
 

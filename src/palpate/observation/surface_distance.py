@@ -23,15 +23,15 @@ from palpate.observation.noise_model import (
     fit_noise_model,
 )
 from palpate.observation.observed_surface import ObservedSurface, field_of_view, observed_surfaces, seen_in
-from palpate.observation.robust_loss import HUBER, Huber, RobustLoss, Tukey
+from palpate.observation.robust_loss import Huber, PowerLaw, RobustLoss
 from palpate.observation.surface_residuals import Correspondence, correspondence, surface_residuals
 from palpate.observation.target import SurfaceTarget, surface_target
 from palpate.parallel import mapped
 
-TUKEY = 4.685  # cutoff in standard deviations, 95 % efficient for normal errors (Huber 1981)
-MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
-LEAST_CUTOFF = 5e-3  # mm
+HUBER, FAR = 1.345, 3.0  # cutoffs in standard deviations: 95 and 99 % efficient for normal errors (Huber 1981)
+FLOOR = 1e-3  # mm: no surface in an image is known better
 LEAST_POINTS = 30  # of a surface that is neither an organ's nor a driver's, to be compared
+RIGID = 6.0  # freedoms of a rigid motion
 AROUND = 8.0  # widths of the Gaussian, within which the maps of an imaged model are asked
 
 
@@ -44,7 +44,7 @@ class SurfaceDistance:
     point x = X + u(X) from the image point y, positive when the model lies outside; b is `held.excess`. Each direction
     has half of the weight, shared out by area and, where voxels' terraces add to the noise n (mm^4, its variance times
     its correlation area), as n / (n + terraces). stated_noise: that of the case, which holds whatever the residuals
-    say; unfollowed: of a driver's residuals what no modes followed, the smallest mean square (mm^2) so far.
+    say.
     """
 
     target: SurfaceTarget
@@ -52,7 +52,6 @@ class SurfaceDistance:
     noise_model: NoiseModel
     weighting: Weighting
     stated_noise: NoiseModel | None = None
-    unfollowed: float = np.inf
 
     @property
     def kind(self) -> str:
@@ -109,11 +108,16 @@ class SurfaceDistance:
         and facets change as the surface slides along itself, which tells nothing of how it slides.
         """
         found = surface_residuals(self.target, self._drawn(displacement, offset), self.held)
-        noise = self.noise_model.sd**2 * self.noise_model.correlation_area
-        terraces = np.concatenate([self.held.of_model(self.target.terraces), self.held.terraces[self.held.kept]])
-        weights = found.weights * noise / (noise + terraces)
         places = found.places - offset * found.normals  # in the body, not on what is drawn of it
-        return replace(found, places=places, weights=weights * (found.weights.sum() / weights.sum()))
+        return self.weighed(replace(found, places=places, shares=found.weights))
+
+    def weighed(self, residuals: Residuals) -> Residuals:
+        """The same residuals, those where terraces add to the noise with less weight."""
+        noise, shares = self.noise_model.sd**2 * self.noise_model.correlation_area, residuals.shares
+        assert shares is not None, "residuals of a surface have weights by area"
+        terraces = np.concatenate([self.held.of_model(self.target.terraces), self.held.terraces[self.held.kept]])
+        weights = shares * noise / (noise + terraces)
+        return replace(residuals, weights=weights * (shares.sum() / weights.sum()))
 
     def rematched(self, displacement: NDArray[np.float64], offset: float = 0.0) -> SurfaceDistance:
         """The same with the points that both images show chosen at a displacement (n_dofs,) mm and an offset, mm.
@@ -131,26 +135,25 @@ class SurfaceDistance:
 
     def with_noise(self, noise: NoiseModel) -> SurfaceDistance:
         """All residuals and all image points count, its independent ones by their variance."""
-        return replace(
-            self, held=_everywhere(self.target), noise_model=noise, weighting=Weighting(self._precision(noise), Tukey())
-        )
+        count = self._count(noise)
+        weighting = Weighting(count / noise.sd**2, PowerLaw(), count)
+        return replace(self, held=_everywhere(self.target), noise_model=noise, weighting=weighting)
 
-    def reweighted(self, residuals: Residuals, beyond_modes: NDArray[np.float64] | None = None) -> SurfaceDistance:
-        """The same with a robust loss by its residuals.
+    @property
+    def sd_bounds(self) -> tuple[float, float]:
+        """From what no image knows better, or the case states, on."""
+        return (FLOOR if self.stated_noise is None else self.stated_noise.sd), np.inf
 
-        A surface that fits worse than the noise (a driver whose modes cannot follow its wall) counts by its own mean
-        square, so that its misfit is not forced into the other unknowns; of a driver by the part beyond_modes (n,) mm,
-        the smallest so far: one that counted less for what it does not follow yet, or for having been led away from its
-        wall, would follow it still less.
-        """
-        loss = robust_loss(residuals.values, self.target)
-        if beyond_modes is None:
-            unfollowed, mean_square = self.unfollowed, loss.mean_square(residuals.values, residuals.weights)
-        else:
-            unfollowed = mean_square = min(self.unfollowed, loss.mean_square(beyond_modes, residuals.weights))
-        share = min(1.0, self.noise_model.sd**2 / max(mean_square, 1e-12))
-        weighting = Weighting(self._precision(self.noise_model) * share, loss)
-        return replace(self, weighting=weighting, unfollowed=unfollowed)
+    def with_sd(self, sd: float) -> SurfaceDistance:
+        """The same with the loss of that scale (see `robust_loss`)."""
+        count = self.weighting.count
+        return replace(self, weighting=Weighting(count / sd**2, robust_loss(sd, self.target), count))
+
+    def with_correlation(self, noise: NoiseModel) -> SurfaceDistance:
+        """The same with another number of independent residuals, and its terraces beside that noise."""
+        count = self._count(noise)
+        weighting = replace(self.weighting, precision=count / self.weighting.sd**2, count=count)
+        return replace(self, noise_model=noise, weighting=weighting)
 
     def first_noise(self, peers: Sequence[SurfaceDistance]) -> NoiseModel:
         """The rounding of both images' voxels; without any, `EXACT_NOISE`; what is stated, where it is.
@@ -232,15 +235,18 @@ class SurfaceDistance:
             return moved
         return moved + offset * vertex_normals(surface.rest + moved, surface.triangles)
 
-    def _precision(self, noise: NoiseModel) -> float:
-        """Weight (mm^-2) of the surface's mean square: its independent residuals, by their variance."""
-        return max(float(self.held.of_model(self.target.area).sum()) / noise.correlation_area, 1.0) / noise.sd**2
+    def _count(self, noise: NoiseModel) -> float:
+        """Number of independent residuals: the area that is compared by that over which errors are alike.
+
+        At least as many as a rigid motion has freedoms: what is alike over more of a surface is motion of it.
+        """
+        return max(float(self.held.of_model(self.target.area).sum()) / noise.correlation_area, RIGID)
 
 
 def surface_distance(target: SurfaceTarget, *, stated_noise: NoiseModel | None = None) -> SurfaceDistance:
     """The observation of one surface; all its residuals count by the stated noise, or by what voxels leave of it."""
     noise = stated_noise or SEGMENTATION_NOISE
-    made = SurfaceDistance(target, _everywhere(target), noise, Weighting(1.0, Tukey()), stated_noise)
+    made = SurfaceDistance(target, _everywhere(target), noise, Weighting(1.0, PowerLaw()), stated_noise)
     return made.with_noise(made.first_noise((made,)))
 
 
@@ -269,23 +275,19 @@ def surface_distances(
     return tuple(found)
 
 
-def robust_loss(values: NDArray[np.float64], target: SurfaceTarget) -> RobustLoss:
-    """The loss for residuals (n,) mm of one surface: Tukey's of an organ, Huber's of a driver.
+def robust_loss(sd: float, target: SurfaceTarget) -> RobustLoss:
+    """The loss of residuals of scale sd (mm) of one surface: with a power law's tails of an organ, Huber's of a driver.
 
-    A cutoff is 4.685 or 1.345 of their robust standard deviations. Up to the edge of a voxel (half of each image's;
-    root mean square of the three edges) all count fully: so far can rounding move a surface that runs along the grids,
-    and terraces that flip as a whole are no outliers. They are rare and large and carry the motion of a surface that
-    else seems to stand still: if they counted less than what is quiet, every motion would be found too small.
+    A cutoff is 3 or 1.345 scales, and at least the edge of a voxel (half of each image's; root mean square of the three
+    edges): so far can rounding move a surface that runs along the grids, and terraces that flip as a whole are no
+    outliers. They are rare and large and carry the motion of a surface that else seems to stand still: if they counted
+    less than what is quiet, every motion would be found too small.
 
     A driver's wall moves by modes that its own residuals hold, beside a prior that is learned from them. A part of it
-    that a biweight rejects is held by the prior alone, which then seems to say more, moves the wall further off, and
-    has more of it rejected: two estimates would agree with their own weights, and one of them is wrong.
+    that no longer pulls is held by the prior alone, which then seems to say more and moves the wall further off.
     """
-    spread = MAD * float(np.median(np.abs(values)))
     rounding = float(sum(0.5 * np.sqrt(np.mean(image.grid.spacing**2)) for image in target.voxels or ()))
-    if target.surface.driver:
-        return Huber(max(HUBER * spread, LEAST_CUTOFF, rounding))
-    return Tukey(max(TUKEY * spread, LEAST_CUTOFF), rounding)
+    return Huber(max(HUBER * sd, rounding)) if target.surface.driver else PowerLaw(max(FAR * sd, rounding))
 
 
 def _everywhere(target: SurfaceTarget) -> Correspondence:

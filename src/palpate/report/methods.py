@@ -22,7 +22,6 @@ ALIGNED = {
     "rigid-tissues": " The later images were brought to the first on the rigid tissues.",
     "surfaces": " The later images were brought to the first by the rigid motion that most of the surfaces agree on.",
 }
-OPTIMISERS = {"gauss-newton": ("Gauss-Newton steps in a trust region", "nocedal"), "lbfgs": ("L-BFGS-B", "byrd")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,15 +143,15 @@ def _law(data: ReportData) -> Law | None:
 
 
 def _fit(data: ReportData, cite: _Citations) -> str:
-    optimiser, source = OPTIMISERS.get(data.document["method"], (str(data.document["method"]), "nocedal"))
     starts = len(data.document["starts"])
     law = _law(data)
     finite = law is not None and law.finite
     onwards = " The linear law gave the start; the fit then went on over expansions around finite-strain equilibria."
     observed = listed(list(data.document.get("observations", {}).values())) or "what the case's observations compare"
     return (
-        f"The misfit was {observed}. Outliers counted less: by Tukey's biweight, on the drivers' walls by Huber's loss"
-        f" {cite('huber')}. It was minimised over the logarithms of the moduli from {starts} starts by {optimiser}"
-        f" {cite(source)}, on a reduced basis whose error was bounded at the estimate {cite('reduced')}."
-        f"{onwards if finite else ''}"
+        f"The misfit was {observed}. Outliers counted less: by densities with the tails of a power law, on the drivers'"
+        f" walls by Huber's loss {cite('huber')}. Minus the log posterior of the logarithms of the moduli, of all other"
+        f" unknowns, of the noise and of the priors' amplitudes was minimised from {starts} starts by Gauss-Newton"
+        f" steps in a trust region {cite('nocedal')}, on a reduced basis whose error was bounded at the estimate"
+        f" {cite('reduced')}.{onwards if finite else ''}"
     )

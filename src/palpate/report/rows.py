@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from palpate.inversion import FIELD, KNOWN_MODULUS
 from palpate.uncertainty import NORMAL_95, Interval
+from palpate.unknowns import FIELD, KNOWN_MODULUS
 
 NONE = "–"
 BELIEVED = "what was believed before"
@@ -280,7 +280,7 @@ def headline(document: Mapping[str, Any]) -> Headline:
     sentences = [FOUND[verdict].format(listed(verdicts[verdict])) for verdict in FOUND if verdict in verdicts]
     starts = document["starts"]
     if len(starts) > 1:
-        answers = len({start["minimum"] for start in starts})
+        answers = len({start["minimum"] for start in starts if start["minimum"] is not None})
         several = f"The search from {len(starts)} starts led to {answers} different answers; the best one is shown."
         same = f"The search led to the same answer from all {len(starts)} starts."
         sentences.append(several if answers > 1 else same)

@@ -13,20 +13,7 @@ from palpate.errors import ConfigurationError
 from palpate.findings import Finding
 from palpate.images.distance import observation_width
 from palpate.images.tissue import Role
-from palpate.inversion import (
-    Block,
-    InverseProblem,
-    LaterState,
-    frame_blocks,
-    instrument_block,
-    known_modulus_blocks,
-    layer_blocks,
-    material_blocks,
-    offset_block,
-    parameter_map,
-    unit_blocks,
-    wall_blocks,
-)
+from palpate.inversion import InverseProblem, LaterState
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.conditions import Conditions
 from palpate.mechanics.dilatation import choose_element
@@ -52,6 +39,18 @@ from palpate.study.edge_length import EdgeLength
 from palpate.study.imaged import ImagedStates
 from palpate.study.meshing import ReferenceMesh, mesh_reference
 from palpate.study.poisson_ratios import with_stated_priors
+from palpate.unknowns import (
+    Block,
+    frame_blocks,
+    instrument_block,
+    known_modulus_blocks,
+    layer_blocks,
+    material_blocks,
+    offset_block,
+    parameter_map,
+    unit_blocks,
+    wall_blocks,
+)
 
 NOTHING_MOVES = (
     'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'

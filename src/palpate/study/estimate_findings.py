@@ -33,11 +33,11 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
                 " tissue role `known` with its youngs_modulus_kpa to get kPa",
             )
         )
-    if inversion.minimum.converged and inversion.convergence.unmet:
+    if inversion.convergence.unmet:
         findings.append(
             Finding(
                 "unsettled",
-                f"the outer loop ended at its largest number of iterations: {'; '.join(inversion.convergence.unmet)};"
+                f"the iteration ended with what it asks for not met: {'; '.join(inversion.convergence.unmet)};"
                 " the model may not fit the images (edge length, driver modes, law), or [noise] should be given",
             )
         )
@@ -102,7 +102,7 @@ def data_findings(inversion: Inversion) -> tuple[Finding, ...]:
     And for each reading of an instrument whose sign no modulus gives.
     """
     findings, mapping, unknowns = [], inversion.objective.parameters, inversion.minimum.unknowns
-    for line in inversion.minimum.evaluation.lines:
+    for line in inversion.minimum.evaluation.linearisations:
         seen = line.observation
         if isinstance(seen, OfInstrument):
             names, offsets = mapping.offset_names(line.state), mapping.offsets(unknowns, line.state)

@@ -31,7 +31,8 @@ class Iteration:
 class Start:
     """What one start did alone: moduli (kPa, or ratios) it began and ended with, its steps and how they ended.
 
-    minimum: number, from 0, of the distinct minimum that it leads to.
+    minimum: number, from 0, of the distinct minimum that it leads to; None where that was not followed, others being
+    lower.
     """
 
     start: Mapping[str, float]
@@ -39,7 +40,7 @@ class Start:
     objective_mm2: float
     status: str
     reason: str
-    minimum: int
+    minimum: int | None
     history: tuple[Iteration, ...]
 
     @property

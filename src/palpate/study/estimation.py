@@ -18,6 +18,7 @@ from palpate.inversion import (
     Outcome,
     OuterIterate,
     StartRun,
+    frozen_posterior,
     with_released,
 )
 from palpate.mesh.voxelise import voxelise
@@ -36,7 +37,6 @@ from palpate.uncertainty import (
     Covariance,
     FittedState,
     covariance_of,
-    frozen_posterior,
     grid_errors,
     information,
     information_shares,
@@ -222,7 +222,7 @@ def _fit(line: Linearisation, modelled: NDArray[np.int16] | None, image: NDArray
 def _measured(inversion: Inversion, observed: Observed) -> tuple[tuple[ForceFit, ...], tuple[PointFit, ...]]:
     """Readings of instruments, and the points of all observations that have some, beside what the fitted model says."""
     forces, points = list[ForceFit](), list[PointFit]()
-    for line in inversion.minimum.evaluation.lines:
+    for line in inversion.minimum.evaluation.linearisations:
         seen, name = line.observation, line.observation.name
         if isinstance(seen, OfInstrument):
             fitted = seen.measured + float(line.residuals.values[0])
@@ -240,7 +240,7 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
     for s, (fitted, image) in enumerate(zip(observed.states, observed.images, strict=True)):
         motions = (np.zeros_like(fitted.displacement), fitted.displacement)
         modelled = [None if image is None else voxelise(fitted.space, u, fitted.after, crossing=True) for u in motions]
-        seen = zip(inversion.rest.lines, inversion.minimum.evaluation.lines, strict=True)
+        seen = zip(inversion.rest.linearisations, inversion.minimum.evaluation.linearisations, strict=True)
         of_state = [pair for pair in seen if pair[0].state == s and pair[0].observation.unit == "mm"]
         fits.append(
             tuple(

@@ -52,7 +52,7 @@ def inverted(
             for reference, body in enumerate(bodies)
         ]
         problem = joint_problem(strained, case, progress=there)
-        found = invert(problem, replace(settings, starts=(theta,)), progress=there, rule=rule)
+        found = invert(problem, replace(settings, starts=(theta,), further=()), progress=there, rule=rule)
         change = float(np.abs(_theta(found) - theta).max())
         if change < SETTLED:
             return found

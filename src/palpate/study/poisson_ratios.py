@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from palpate.inversion import ParameterMap, eta_of_ratio
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case
 from palpate.study.case_tissue import RATIO_SD
 from palpate.uncertainty import Interval
+from palpate.unknowns import ParameterMap, eta_of_ratio
 
 NOT_IDENTIFIED = "not identified"  # the verdict of what has no interval
 IDENTIFIED, WEAK = 0.05, 0.2  # largest width of an interval; soft tissue is usually given 0.40 to 0.49

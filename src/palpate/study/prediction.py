@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from palpate.inversion import first_noise_of, fit_coefficients
-from palpate.inversion.optimise import TO_THE_NOISE
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress
 from palpate.study.body import Body, joint_problem, on_linear_elements
@@ -115,7 +114,7 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
     for i, name in enumerate(objective.parameters.tissues):
         if (kpa := stated.get(name)) is not None:
             guess[i] = float(np.log(kpa / objective.parameters.scale_kpa))
-    fitted = fit_coefficients(objective, guess, bounds=settings.bounds, tolerance=TO_THE_NOISE)
+    fitted = fit_coefficients(objective, guess, bounds=settings.bounds)
     found = covariance_of(objective, fitted.evaluation, (), unknowns=fitted.unknowns, noise_of=noise_of)
     free = sandwich_covariance(*objective.released(fitted.evaluation, fitted.unknowns), noise_of)
     found = found.with_released(objective, fitted.evaluation, free)

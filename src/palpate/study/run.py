@@ -7,11 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import qmc
 
 from palpate.errors import ConfigurationError, EstimationError, ResourceError
 from palpate.findings import Finding, of_pair
 from palpate.images.tissue import Role
-from palpate.inversion import Bounds, Inversion, InversionSettings, ParameterMap, eta_of_ratio
+from palpate.inversion import Bounds, Inversion, InversionSettings
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
@@ -34,6 +35,9 @@ from palpate.study.result import CaseResult, MeshResult, MeshSummary, PairResult
 from palpate.study.samples import require_samples
 from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
+from palpate.unknowns import ParameterMap, eta_of_ratio
+
+FURTHER = 13  # starts beside those of the case
 
 
 def estimate(
@@ -179,7 +183,10 @@ def _forecast(cost: ExpectedCost) -> Forecast:
 
 
 def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSettings:
-    """Starts and bounds as theta; those in kPa are divided by the scale's modulus, Poisson's ratios begin as given."""
+    """Starts and bounds as theta; those in kPa are divided by the scale's modulus, Poisson's ratios begin as given.
+
+    The case's starts, on the diagonal of all moduli, then some of a Sobol sequence over the bounds.
+    """
     scale = parameters.scale_kpa
     options = case.estimate
     starts = np.array(options.starts_kpa) / scale if options.starts_kpa else np.array(options.start_ratios)
@@ -190,7 +197,10 @@ def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSetting
         for e, r in zip(bounds, SOUGHT_RATIOS, strict=True)
     ]
     begin = tuple(np.concatenate([np.full(n, np.log(start)), given]) for start in starts)
-    return InversionSettings(begin, Bounds(*ends), options.method)
+    low, high = (end[:n] for end in ends)
+    shares = qmc.Sobol(n, scramble=False).random_base2(4)[1 : 1 + FURTHER]  # the first is a corner
+    further = tuple(np.concatenate([low + share * (high - low), given]) for share in shares)
+    return InversionSettings(begin, Bounds(*ends), further)
 
 
 def observed_of(inversion: Inversion, bodies: Sequence[Body]) -> Observed:
@@ -247,6 +257,11 @@ def refuse_what_cannot_be_estimated(case: Case) -> None:
     if case.images is not None and not case.images.after:
         raise ConfigurationError(
             "the key 'after' is missing in [images]; an estimate needs one or more later states of the body"
+        )
+    if case.estimate.method != "gauss-newton":
+        raise ConfigurationError(
+            f"[estimate] method = '{case.estimate.method}' is no longer there: it ended where 'gauss-newton' does, and"
+            " took longer; write that, or leave the key out"
         )
     movers = [tissue for tissue in case.tissues if tissue.role in (Role.DRIVER, Role.RIGID)]
     if case.tissues and case.images is not None and not movers and not case.loads and not case.data:

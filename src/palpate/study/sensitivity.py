@@ -199,7 +199,7 @@ def _inverted(
     settings = inversion_settings(case, problem.parameters)
     if start is not None:
         inside = np.clip(start, settings.bounds.lower, settings.bounds.upper)
-        settings = replace(settings, starts=(inside,))
+        settings = replace(settings, starts=(inside,), further=())
         return inverted(bodies, problem, case, settings, progress=progress, rule=VARIED), settings
     return inverted(bodies, problem, case, settings, progress=progress), settings
 

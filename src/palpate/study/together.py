@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from palpate.inversion import Bounds, Inversion, LeastSquares, Minimum, OuterIterate
+from palpate.inversion import Bounds, FrozenPosterior, Inversion, LeastSquares, Minimum, OuterIterate
 from palpate.parallel import mapped
 from palpate.uncertainty import (
     NORMAL_95,
     Combination,
-    FrozenPosterior,
     GridErrors,
     JointRegion,
     agreement,

@@ -8,12 +8,13 @@ from itertools import product
 
 import numpy as np
 
-from palpate.inversion import KNOWN_MODULUS, Inversion, InversionSettings, as_good, ratio_of_eta
+from palpate.inversion import Inversion, InversionSettings, as_good
 from palpate.parallel import mapped
 from palpate.study.estimated import ModulusEstimate, no_estimate
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.together import StatedPosterior
 from palpate.uncertainty import NORMAL_95, Covariance, Interval, ModulusInterval, log_interval, modulus_interval
+from palpate.unknowns import KNOWN_MODULUS, ratio_of_eta
 
 IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
 

@@ -21,8 +21,6 @@ from palpate.uncertainty.covariance import sandwich_covariance as sandwich_covar
 from palpate.uncertainty.diagnostics import ChainDiagnostics as ChainDiagnostics
 from palpate.uncertainty.diagnostics import chain_diagnostics as chain_diagnostics
 from palpate.uncertainty.diagnostics import require_arviz as require_arviz
-from palpate.uncertainty.frozen_posterior import FrozenPosterior as FrozenPosterior
-from palpate.uncertainty.frozen_posterior import frozen_posterior as frozen_posterior
 from palpate.uncertainty.image_pairs import Agreement as Agreement
 from palpate.uncertainty.image_pairs import PairEstimates as PairEstimates
 from palpate.uncertainty.image_pairs import agreement as agreement
@@ -35,9 +33,7 @@ from palpate.uncertainty.intervals import log_interval as log_interval
 from palpate.uncertainty.intervals import modulus_interval as modulus_interval
 from palpate.uncertainty.joint_region import JointRegion as JointRegion
 from palpate.uncertainty.joint_region import joint_region as joint_region
-from palpate.uncertainty.profile import FixedCorrespondence as FixedCorrespondence
 from palpate.uncertainty.profile import Profile as Profile
-from palpate.uncertainty.profile import fixed_correspondence as fixed_correspondence
 from palpate.uncertainty.profile import refitted as refitted
 from palpate.uncertainty.sampling import PosteriorChains as PosteriorChains
 from palpate.uncertainty.sampling import posterior_chains as posterior_chains

@@ -13,9 +13,8 @@ from scipy import sparse
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import cropped, window_of
-from palpate.inversion.evidence import undecided_covariance
+from palpate.inversion.hyper_parameters import of_one_noise, undecided_covariance
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
-from palpate.inversion.reweighting import of_one_noise
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Imaged
@@ -52,7 +51,9 @@ def gain(evaluation: Evaluation, n_parameters: int) -> tuple[NDArray[np.float64]
 
 def _gain(evaluation: Evaluation, rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
     """The same of combinations of the unknowns, with their rows (k, n_unknowns) of H^-1."""
-    return tuple(s.jacobian.times(rows[:, s.columns].T).T * (s.precision * s.weights) for s in evaluation.lines)
+    return tuple(
+        s.jacobian.times(rows[:, s.columns].T).T * (s.precision * s.weights) for s in evaluation.linearisations
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +184,7 @@ def _given_model(objective: Objective, evaluation: Evaluation) -> Evaluation:
     if len(own) == parameters.n_unknowns:
         return evaluation
     lines = []
-    for line in evaluation.lines:
+    for line in evaluation.linearisations:
         inside = np.isin(line.columns, own)
         columns = np.searchsorted(own, line.columns[inside])
         lines.append(replace(line, columns=columns, jacobian=line.jacobian.of_columns(inside)))
@@ -193,7 +194,7 @@ def _given_model(objective: Objective, evaluation: Evaluation) -> Evaluation:
         gradient=evaluation.gradient[own],
         score=evaluation.score[own],
         matrix=evaluation.matrix[within],
-        lines=tuple(lines),
+        linearisations=tuple(lines),
         prior=evaluation.prior[within],
         prior_score=evaluation.prior_score[own],
     )
@@ -248,7 +249,9 @@ def _sandwich(
     noise_of: Mapping[tuple[int, str], NoiseModel],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Its two parts, (k, k) each, of unknowns with their rows (k, n_unknowns) of H^-1: by residuals, by the prior."""
-    data = noise_covariance(objective, list(zip(evaluation.lines, _gain(evaluation, rows), strict=True)), noise_of)
+    data = noise_covariance(
+        objective, list(zip(evaluation.linearisations, _gain(evaluation, rows), strict=True)), noise_of
+    )
     return data, np.asarray(rows @ evaluation.prior @ rows.T)
 
 
@@ -280,7 +283,7 @@ def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
     The residuals at a minimum are what the fit left of them: see `FitResponse`. What errors of one later image do to
     the residuals of another, by the moduli alone, is neglected.
     """
-    lines, n, found = evaluation.lines, len(evaluation.matrix), {}
+    lines, n, found = evaluation.linearisations, len(evaluation.matrix), {}
     inverse = evaluation.covariance_columns(n)
     for key, (own, telling) in of_one_noise(evaluation).items():
         response = FitResponse(
@@ -366,7 +369,7 @@ def grid_covariance(
     is the less only where it is no kernel's: then the positive part of the difference, with which the noise is at least
     as large as each of the two in every direction.
     """
-    seen = [line.observation for line in evaluation.lines]
+    seen = [line.observation for line in evaluation.linearisations]
     if any(isinstance(o, Imaged) and o.stated_noise is not None for o in seen):
         return grid
     return _positive_part(grid - noise)
@@ -396,12 +399,14 @@ def imaging_errors(
     errors, rest = list[NDArray[np.float64]](), dict[int, Segmentation]()
     references = [state.reference for state in objective.states]
     for s, (reference, fitted) in enumerate(zip(references, states, strict=True)):
-        lines: list[Linearisation] = [line for line in evaluation.lines if line.state == s]
+        lines: list[Linearisation] = [line for line in evaluation.linearisations if line.state == s]
         if not any(isinstance(line.observation, Imaged) for line in lines):
             errors += [np.zeros(len(line.weights)) for line in lines]
             continue
         if reference not in rest:
-            material = [line.residuals.material for line in evaluation.lines if references[line.state] == reference]
+            material = [
+                line.residuals.material for line in evaluation.linearisations if references[line.state] == reference
+            ]
             rest[reference] = _imaged(fitted.space, np.zeros_like(fitted.displacement), fitted.before, material, rng)
         places = [line.residuals.places for line in lines]
         after = _imaged(fitted.space, fitted.displacement, fitted.after, places, rng)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from palpate.inversion import Bounds, Minimum, Objective, OuterIterate, gauss_newton
+from palpate.inversion import Bounds, Minimum, Objective, OuterIterate, fixed_correspondence, gauss_newton
 from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty.covariance import (
     GridErrors,
@@ -27,7 +27,6 @@ from palpate.uncertainty.covariance import (
     shifts_by,
 )
 from palpate.uncertainty.intervals import NORMAL_95, within_subject_cv
-from palpate.uncertainty.profile import fixed_correspondence
 
 OUTLIER = 0.01  # probability, over all pairs together, of calling one an outlier that is none
 MOST_OUTLIERS = 4  # one of so many: where more contradict the others the pairs differ, and none is wrong
@@ -101,10 +100,10 @@ def _each_alone(objective: Objective, minimum: Minimum, bounds: Bounds) -> list[
     found = list[Minimum]()
     for s, state in enumerate(objective.states):
         parameters, own = objective.parameters.alone(s)
-        seen = [line for line in minimum.evaluation.lines if line.state == s]
+        seen = [line for line in minimum.evaluation.linearisations if line.state == s]
         lines = tuple(replace(line, state=0, columns=np.searchsorted(own, line.columns)) for line in seen)
         start = minimum.unknowns[own]
-        evaluation = replace(minimum.evaluation, lines=lines)
+        evaluation = replace(minimum.evaluation, linearisations=lines)
         fixed = fixed_correspondence(Objective((state,), parameters), start, evaluation)
         found.append(gauss_newton(fixed, start, bounds=bounds, tolerance=1e-4))
     return found
@@ -124,7 +123,7 @@ def _noise_and_prior(objective: Objective, alone: Sequence[Minimum]) -> tuple[ND
         columns = slice(s * n, (s + 1) * n)
         answers[mapping.alone(s)[1], columns] = evaluation.covariance_columns(n)
         noise |= {(s, kind): model for (_, kind), model in error_noise(evaluation).items()}
-        for line, rows in zip(evaluation.lines, gain(evaluation, n), strict=True):
+        for line, rows in zip(evaluation.linearisations, gain(evaluation, n), strict=True):
             placed = np.zeros((size, rows.shape[1]))
             placed[columns] = rows
             pairs.append((replace(line, state=s), placed))

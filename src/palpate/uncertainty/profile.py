@@ -14,20 +14,18 @@ from numpy.typing import NDArray
 from palpate.errors import SolverError
 from palpate.inversion import (
     Bounds,
-    Evaluation,
+    FixedCorrespondence,
     LeastSquares,
-    Linearisation,
     LinearisedObjective,
     Minimum,
     Objective,
     Outcome,
+    fixed_correspondence,
     gauss_newton,
     posterior_sd,
-    reweighted,
+    with_correlations,
+    with_hyper_parameters,
 )
-from palpate.mechanics.curved import CurvedModel
-from palpate.mechanics.first_order import FirstOrderModel
-from palpate.mechanics.forward import ForwardModel
 
 TRIALS = 12  # points on a ray from the estimate
 TRIES = 3  # at a point, of as many steps as a minimum has
@@ -36,71 +34,6 @@ FURTHEST = 2.0  # times the distance of the last point: more is not extrapolated
 PASSES = 10
 SETTLED = 0.02  # posterior standard deviations, as the outer loop's own
 TOLERANCE = 1e-6  # decrement of a minimum
-
-
-@dataclass(frozen=True, slots=True)
-class FixedCorrespondence:
-    """An objective whose closest points are those of one evaluation; the model bends as it does.
-
-    Residuals are r_0 + S (u(E, q) - u_0) with the smooth Jacobians S by the displacement, and count by the robust
-    weights w_0 there, as in the Gauss-Newton matrix: J = 1/2 sum_j precision w_0j r_j^2 + prior. What re-chosen closest
-    points add, some tenths of a unit, is noise beside its second derivative, and far away a robust loss would take
-    every residual for an outlier. unknowns (n_unknowns,): those of the evaluation; models: of each state, at its
-    observed unknowns; displacements: u_0 (n_dofs,) mm of each line.
-    """
-
-    objective: Objective
-    unknowns: NDArray[np.float64]
-    models: tuple[ForwardModel, ...]
-    lines: tuple[Linearisation, ...]
-    displacements: tuple[NDArray[np.float64], ...]
-
-    @property
-    def n_parameters(self) -> int:
-        """Number of log-moduli among the unknowns."""
-        return self.objective.n_parameters
-
-    def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
-        """J at `unknowns` (n_unknowns,) with gradient and Gauss-Newton matrix; raises `SolverError`."""
-        mapping, lines = self.objective.parameters, list[Linearisation]()
-        left = iter(zip(self.lines, self.displacements, strict=True))
-        moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
-        for s, (state, model, q) in enumerate(zip(self.objective.states, self.models, coefficients, strict=True)):
-            there = model.solve(moduli, q)
-            tangent = mapping.by_unknowns(there.tangent(), unknowns)
-            offset = mapping.offsets(unknowns - self.unknowns, s)
-            for rows, (line, before) in zip(state.slices, left, strict=False):
-                n_dofs, by_offset = len(before), line.jacobian.tangent[len(before), tangent.shape[1] :] @ offset
-                material = line.jacobian.tangent[n_dofs + 1 :] @ (unknowns - self.unknowns)[line.columns]
-                moved = np.concatenate([there.values[rows] - before, [by_offset], material])
-                values = line.residuals.values + line.jacobian.by_displacement @ moved
-                jacobian = line.jacobian.under(tangent[rows])
-                gradient = jacobian.transposed_times(line.precision * line.weights * values)
-                residuals = replace(line.residuals, values=values)
-                lines.append(replace(line, residuals=residuals, jacobian=jacobian, gradient=gradient))
-        found = self.objective.assembled(unknowns, lines)
-        away = float((unknowns - mapping.prior_centre) @ found.prior_score)
-        squares = sum(line.precision * float(line.weights @ line.residuals.values**2) for line in lines)
-        return replace(found, value=0.5 * (away + squares))
-
-
-def fixed_correspondence(
-    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation
-) -> FixedCorrespondence:
-    """The objective with the closest points and weights of an evaluation at `unknowns` (n_unknowns,).
-
-    Expansions bend as the linear law does (`CurvedModel`).
-    """
-    models, displacements = list[ForwardModel](), list[NDArray[np.float64]]()
-    mapping = objective.parameters
-    moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
-    for state, q in zip(objective.states, coefficients, strict=True):
-        model, like = state.observed, state.bending
-        assert model is not None, "an objective is made of states with approximations"
-        values = model.solve(moduli, q).values
-        displacements += [values[rows] for rows in state.slices]
-        models.append(CurvedModel.of(model, like) if like and isinstance(model, FirstOrderModel) else model)
-    return FixedCorrespondence(objective, unknowns, tuple(models), evaluation.lines, tuple(displacements))
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +98,7 @@ class Ray:
     def _at_its_best(self, start: NDArray[np.float64]) -> Minimum:
         """All that is not held at its best, sought from unknowns (n,), and once more from where that did not end."""
         for _ in range(TRIES):
-            found = gauss_newton(self.fixed, start, bounds=self.bounds, held=self.held, tolerance=1e-4)
+            found = gauss_newton(self.fixed, start, bounds=self.bounds, fixed=self.held, tolerance=1e-4)
             if found.converged:
                 break
             start = found.unknowns
@@ -219,14 +152,15 @@ def refitted(
 ) -> tuple[Minimum, FixedCorrespondence]:
     """The estimate that the residuals in a `minimum`'s evaluation lead to, and what it is the minimum of.
 
-    Reweighted (noise, robust losses, drivers' prior) and minimised in turn, until no log-modulus moves by 0.02 of its
-    standard deviation, `passes` times at the most: where it still does, the minimum has the outcome `STEPS`. No model
-    is solved. Raises `EstimationError` where the residuals leave an unknown open, `SolverError` where the approximation
-    has no answer.
+    Hyper-parameters and unknowns in turn, until no log-modulus moves by 0.02 of its standard deviation, `passes` times
+    at the most: where it still does, the minimum has the outcome `STEPS`. No model is solved. Raises `EstimationError`
+    where the residuals leave an unknown open, `SolverError` where the approximation has no answer.
     """
     n, now = objective.n_parameters, minimum
+    objective = with_correlations(objective, now.evaluation)
     for _ in range(passes):
-        objective = reweighted(objective, now)
+        here = LinearisedObjective(objective, now.unknowns, now.evaluation)(now.unknowns)
+        objective = with_hyper_parameters(objective, here, now.unknowns)
         weighed = LinearisedObjective(objective, now.unknowns, now.evaluation)(now.unknowns)
         fixed = fixed_correspondence(objective, now.unknowns, weighed)
         before, now = now, gauss_newton(fixed, now.unknowns, bounds=bounds, tolerance=TOLERANCE, max_steps=max_steps)

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from palpate.approximation.contract import determined
 from palpate.errors import EstimationError
-from palpate.inversion.blocks import in_series, in_series_slopes, of_series
-from palpate.inversion.objective import Evaluation, determined
+from palpate.inversion import FrozenPosterior
+from palpate.inversion.objective import Evaluation
 from palpate.inversion.optimise import Bounds
-from palpate.uncertainty.frozen_posterior import FrozenPosterior
+from palpate.unknowns.blocks import in_series, in_series_slopes, of_series
 
 STEP = 0.35  # of a proposal, in standard deviations of the posterior
 THIN = 10  # steps of a draw that is kept

@@ -14,8 +14,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion import Bounds, Evaluation, Linearisation, Minimum, Objective, gauss_newton
-from palpate.inversion.expansion import Expansion
+from palpate.approximation.expansion import Expansion
+from palpate.inversion import (
+    Bounds,
+    Evaluation,
+    FixedCorrespondence,
+    Linearisation,
+    Minimum,
+    Objective,
+    fixed_correspondence,
+    gauss_newton,
+)
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, finite_strain_model
 from palpate.mechanics.hyperelastic import elements_of
@@ -23,7 +32,7 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents
 from palpate.mechanics.newton import NewtonSettings
 from palpate.observation.contract import Imaged, OfMaterial, seen_by
-from palpate.uncertainty.profile import PASSES, FixedCorrespondence, fixed_correspondence, refitted
+from palpate.uncertainty.profile import PASSES, refitted
 
 TOLERANCE = 1e-6  # decrement of a minimum
 STEPS = 120  # at the most: a modulus that runs away has far to go
@@ -59,7 +68,7 @@ class FastPath:
 
         passes: see `refitted`, which also tells what is raised.
         """
-        moved = replace(self.least, evaluation=replace(self.least.evaluation, lines=self._moved(errors)))
+        moved = replace(self.least, evaluation=replace(self.least.evaluation, linearisations=self._moved(errors)))
         return self._shift(refitted(self.fixed.objective, moved, self.bounds, max_steps=STEPS, passes=passes)[0])
 
     def shift(self, errors: Errors = (), *, width: float = 1.0, dropped: NDArray[np.bool_] | None = None) -> Shift:
@@ -82,7 +91,7 @@ class FastPath:
 
     def _moved(self, errors: Errors, lines: tuple[Linearisation, ...] = ()) -> tuple[Linearisation, ...]:
         """Lines, by default those at the estimate, with their residuals changed."""
-        pairs = zip(lines or self.least.evaluation.lines, errors, strict=True)
+        pairs = zip(lines or self.least.evaluation.linearisations, errors, strict=True)
         return tuple(replace(o, residuals=replace(o.residuals, values=o.residuals.values + e)) for o, e in pairs)
 
     def _shift(self, found: Minimum) -> Shift:
@@ -99,7 +108,9 @@ def fast_path(objective: Objective, minimum: Minimum, bounds: Bounds) -> FastPat
 def exact_equilibria(objective: Objective, unknowns: NDArray[np.float64]) -> Equilibria:
     """The equilibrium of each later state at unknowns (n_unknowns,), with its factorisation; raises `SolverError`."""
     found: list[LinearEquilibrium | FiniteStrainEquilibrium] = []
-    for state, of, place in zip(objective.states, objective.approximations, objective.places(unknowns), strict=True):
+    for state, of, place in zip(
+        objective.states, objective.approximations, objective.linearisation_points(unknowns), strict=True
+    ):
         found.append(
             of.equilibrium if isinstance(of, Expansion) else state.model.solve(place.moduli, place.coefficients)
         )
@@ -121,7 +132,9 @@ def poisson_errors(
         for there in equilibria
     ]
     moved = _of_displacements(evaluation, tangents)
-    return tuple(e + _by_poisson(line, equilibria[line.state]) for line, e in zip(evaluation.lines, moved, strict=True))
+    return tuple(
+        e + _by_poisson(line, equilibria[line.state]) for line, e in zip(evaluation.linearisations, moved, strict=True)
+    )
 
 
 def _by_poisson(line: Linearisation, there: LinearEquilibrium | FiniteStrainEquilibrium) -> NDArray[np.float64] | float:
@@ -151,7 +164,7 @@ def _of_displacements(evaluation: Evaluation, changes: Sequence[NDArray[np.float
     """Changes of each observation's residuals, mm, by changes (n_dof, ...) mm of the states' displacements."""
     return tuple(
         np.asarray(line.residuals.smooth_jacobian @ seen_by(line.observation, changes[line.state]))
-        for line in evaluation.lines
+        for line in evaluation.linearisations
     )
 
 
@@ -181,8 +194,8 @@ def _under_law(
 
 def modulus_errors(objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation) -> Errors:
     """Derivatives (n, n_regions) mm of each observation's residuals by ln E of the regions, known ones among them."""
-    found, lines = [], iter(evaluation.lines)
-    for state, place in zip(objective.states, objective.places(unknowns), strict=True):
+    found, lines = [], iter(evaluation.linearisations)
+    for state, place in zip(objective.states, objective.linearisation_points(unknowns), strict=True):
         assert state.observed is not None, "an objective is made of states with approximations"
         tangent = state.observed.solve(place.moduli, place.coefficients).tangent()[:, : len(place.moduli)]
         for rows in state.slices:
@@ -200,8 +213,8 @@ def surface_errors(evaluation: Evaluation, tissue: str) -> Errors:
     the same growth in the first image, the mesh held, has the opposite effect: residuals are differences.
     """
     found = []
-    for line in evaluation.lines:
-        seen, peers = line.observation, [o.observation for o in evaluation.lines if o.state == line.state]
+    for line in evaluation.linearisations:
+        seen, peers = line.observation, [o.observation for o in evaluation.linearisations if o.state == line.state]
         if isinstance(seen, Imaged):
             found.append(seen.growth_error(line.residuals, tissue, peers))
         else:

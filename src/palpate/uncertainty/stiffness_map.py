@@ -10,11 +10,12 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtr
 
-from palpate.inversion import FIELD, Acts, Block, Inversion, TotalVariation
+from palpate.inversion import Inversion
 from palpate.mechanics.material import field_modes
 from palpate.mesh.tet_mesh import FACES, TetMesh
 from palpate.uncertainty.covariance import covariance_among
 from palpate.uncertainty.intervals import NORMAL_95, Interval
+from palpate.unknowns import FIELD, Acts, Block, TotalVariation
 
 CONTRAST = 1.5  # from which a part of a tissue is another stiffness, and not its own scatter
 CERTAIN, LIKELY = 0.95, 0.5  # posterior probability of that: somewhere in a region that is reported, all over it

@@ -8,20 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation import LinearisationPoint, ReducedBasis, reduced_basis
 from palpate.images import Role, Tissue
-from palpate.inversion import (
-    Bounds,
-    InverseProblem,
-    InversionSettings,
-    LaterState,
-    Place,
-    ReducedBasis,
-    StopRule,
-    invert,
-    parameter_map,
-    reduced_basis,
-    unit_blocks,
-)
+from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, StopRule, invert
 from palpate.mechanics import Conditions, LinearModel, LinearSystem, linear_model, outer_constraint
 from palpate.mesh import Anatomy, LagrangeSpace, lagrange_space, tetrahedralise
 from palpate.observation import NoiseModel, observed_surface, prescribed_motion, surface_distance
@@ -35,6 +24,7 @@ from palpate.phantoms import (
     smooth_field,
 )
 from palpate.study import DriverMotion
+from palpate.unknowns import parameter_map, unit_blocks
 from palpate_validation.truth import target_of_truth
 
 __all__ = ["ORGANS", "CohortSettings", "PatientResult", "estimate_patient", "patient_space", "true_moduli"]
@@ -47,9 +37,7 @@ FIELD_MM = (110.0, 120.0, 120.0)
 POISSON_RATIO = 0.45
 SPREAD = 3.0  # the reduced model is made at the middle modulus, and at it times and over this factor
 SEARCHED = (0.1, 100.0)  # bounds of the moduli, relative to the surroundings
-REDUCED_ALONE = StopRule(  # residuals are weighted robustly once, and the full model is not asked again
-    step_sd=np.inf, model_error=np.inf, derivatives=False, solve_above=np.inf, passes=1, iterations=1
-)
+REDUCED_ALONE = StopRule(step_sd=0.1, model_error=np.inf, derivatives=False)  # the full model is not asked again
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +154,7 @@ class _Pair:
         settings = InversionSettings((np.log(np.full(len(ORGANS), 2.0)),), bounds)
         found = invert(problem, settings, progress=lambda _: None, rule=REDUCED_ALONE).minimum
         coefficients = problem.parameters.coefficients(found.unknowns)[0]
-        bound = self.basis.error(Place(problem.parameters.moduli(found.unknowns), coefficients)).relative
+        bound = self.basis.error(LinearisationPoint(problem.parameters.moduli(found.unknowns), coefficients)).relative
         return _Estimate(SURROUNDINGS_KPA * np.exp(found.unknowns[: len(ORGANS)]), found.converged, bound)
 
     def problem(self) -> InverseProblem:

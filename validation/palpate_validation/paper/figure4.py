@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from palpate.errors import NotConverged
-from palpate.inversion import InverseProblem, Inversion, LaterState, invert, parameter_map, unit_blocks
+from palpate.inversion import InverseProblem, Inversion, LaterState, invert
 from palpate.mechanics import (
     ACCURACY,
     Conditions,
@@ -29,6 +29,7 @@ from palpate.mechanics import (
     linear_model,
 )
 from palpate.mesh import Constraint, LagrangeSpace
+from palpate.unknowns import parameter_map, unit_blocks
 from palpate_validation.paper.balls import (
     BODIES,
     POISSON_RATIO,

@@ -10,16 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation import ReducedBasis, reduced_basis
 from palpate.images import VoxelGrid, observation_width, smoothing_width
-from palpate.inversion import (
-    InverseProblem,
-    LaterState,
-    ReducedBasis,
-    invert,
-    parameter_map,
-    reduced_basis,
-    unit_blocks,
-)
+from palpate.inversion import InverseProblem, LaterState, invert
 from palpate.mechanics import (
     LinearisedSystem,
     LinearModel,
@@ -40,6 +33,7 @@ from palpate.study import (
     Phantom,
     inverse_problem,
 )
+from palpate.unknowns import parameter_map, unit_blocks
 from palpate_validation.paper.columns import (
     entries_by_the_paper,
     entries_from_surfaces,

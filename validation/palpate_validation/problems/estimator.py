@@ -5,11 +5,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion import Inversion, InversionSettings, Objective, gauss_newton, invert, with_first_noise
+from palpate.inversion import (
+    Inversion,
+    InversionSettings,
+    Objective,
+    StopRule,
+    begun,
+    invert,
+    minimised,
+    with_first_noise,
+)
 from palpate.mechanics import ForwardModel, LinearModel
 from palpate.mesh import lagrange_space
 from palpate.observation import NoiseModel
 from palpate.phantoms import smooth_field
+from palpate.progress import silent
 from palpate.study import verdict
 from palpate.uncertainty import NORMAL_95, log_interval, sandwich_covariance
 from palpate_validation.problems.concentric import SENSITIVITIES, hollow_spheres, radial
@@ -53,7 +63,8 @@ def coverage(repeats: int, seed: int) -> Array:
         noise = smooth_field(rng, sd_mm=NOISE_SD, correlation_mm=NOISE_LENGTH, features=200)
         problem = twin_problem(model, noise, stated_noise=stated)
         objective = with_first_noise(Objective(problem.states, problem.parameters).under([approximation]))
-        found = gauss_newton(objective.rematched(start), start, bounds=settings.bounds)
+        rule = StopRule(model_error=np.inf, derivatives=False, learn=False)
+        found = minimised(begun(objective, start), settings.bounds, rule, progress=silent, title="repeat").minimum
         sd = np.sqrt(np.diag(sandwich_covariance(objective, found.evaluation)))
         inside += np.abs(found.unknowns - truth) < NORMAL_95 * sd
     return np.asarray(inside / repeats)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, parameter_map, unit_blocks
+from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState
 from palpate.mechanics import LinearModel, linear_model, triangle_quadrature
 from palpate.mesh import LevelSet, lagrange_space, triangle_normals
 from palpate.observation import (
@@ -20,6 +20,7 @@ from palpate.observation import (
     target_from,
 )
 from palpate.phantoms import SmoothField
+from palpate.unknowns import parameter_map, unit_blocks
 from palpate_validation.conditions import held_components, sphere_faces
 from palpate_validation.structured_meshes import known, octant_mesh, unknown
 

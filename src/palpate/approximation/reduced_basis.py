@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion.approximation import ModelError, Place
-from palpate.inversion.objective import determined
+from palpate.approximation.contract import LinearisationPoint, ModelError, determined
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem, weighted_sum
 from palpate.mechanics.reduced import Projection, ReducedModel, projection
@@ -38,7 +37,7 @@ class ReducedBasis:
     projection: Projection
     system: LinearSystem
     counts: SolveCounts
-    place: Place | None = None
+    place: LinearisationPoint | None = None
     material_at: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     @property
@@ -62,7 +61,7 @@ class ReducedBasis:
         return self.system.factorisation
 
     @property
-    def reach(self) -> float:
+    def trust_radius(self) -> float:
         """A projection holds however far."""
         return np.inf
 
@@ -71,7 +70,7 @@ class ReducedBasis:
         """Moduli (n_regions,) kPa where it was last made exact with its derivatives."""
         return None if self.place is None or self.place.directions is None else self.place.moduli
 
-    def update(self, at: Place) -> ReducedBasis:
+    def update(self, at: LinearisationPoint) -> ReducedBasis:
         """Add what the reduced model misses at a place: of the displacement there, and of its derivatives.
 
         Both are corrections by conjugate gradients with the factorisation that is there, from the reduced answers on;
@@ -121,7 +120,7 @@ class ReducedBasis:
         """One right-hand side with the last factorisation."""
         return SolveCounts(forward=1)
 
-    def error(self, at: Place) -> ModelError:
+    def error(self, at: LinearisationPoint) -> ModelError:
         """Upper bound of the displacement's relative error in energy (see `LinearSystem.error_bound`).
 
         Of its parts, too, that follow the material modes.
@@ -146,7 +145,7 @@ class ReducedBasis:
             return False
         return not len(self.material_at) or bool(np.abs(np.log(moduli / self.material_at)).max() > STALE)
 
-    def _homogeneous(self, at: Place) -> NDArray[np.float64]:
+    def _homogeneous(self, at: LinearisationPoint) -> NDArray[np.float64]:
         """The displacement (n_dof,) mm at a place as it would be of homogeneous tissues."""
         boundary = self.full_model.constraint.n_modes
         of_boundary = np.where(np.arange(len(at.coefficients)) < boundary, at.coefficients, 0.0)
@@ -161,7 +160,7 @@ class ReducedBasis:
         """
         model, system, regions = self.full_model, self.system, np.flatnonzero(by_theta.any(axis=1))
         n_parameters = by_theta.shape[1]
-        level = self._homogeneous(Place(system.moduli, coefficients))[:, None]
+        level = self._homogeneous(LinearisationPoint(system.moduli, coefficients))[:, None]
         vectors: list[NDArray[np.float64]] = []
         while level.shape[1] * n_parameters + sum(v.shape[1] for v in vectors) <= SERIES:
             by_region = system.modulus_responses(level, regions=regions, tolerance=SNAPSHOT)
@@ -208,7 +207,7 @@ def _with_material_anew(basis: ReducedBasis, displacement: NDArray[np.float64]) 
 
 def _with_sharper_material(
     basis: ReducedBasis,
-    at: Place,
+    at: LinearisationPoint,
     displacement: NDArray[np.float64],
     solved: Callable[[NDArray[np.float64], float], NDArray[np.float64]],
 ) -> ReducedBasis:

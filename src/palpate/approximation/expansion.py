@@ -13,9 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation.contract import Approximation, Derivatives, LinearisationPoint, ModelError, determined
 from palpate.errors import NotConverged, SolverError
-from palpate.inversion.approximation import Approximation, Derivatives, ModelError, Place
-from palpate.inversion.objective import determined
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel
@@ -54,17 +53,17 @@ class Expansion:
         return self.equilibrium.factorisation
 
     @property
-    def reach(self) -> float:
+    def trust_radius(self) -> float:
         """As far as it is trusted."""
         return REACH
 
     @property
-    def place(self) -> Place:
+    def place(self) -> LinearisationPoint:
         """Where it is exact."""
-        return Place(self.equilibrium.moduli, self.equilibrium.coefficients)
+        return LinearisationPoint(self.equilibrium.moduli, self.equilibrium.coefficients)
 
-    def update(self, at: Place) -> Expansion:
-        """The expansion around the equilibrium at another place, its derivatives exact there where they are worth it.
+    def update(self, at: LinearisationPoint) -> Expansion:
+        """The expansion around the equilibrium at another place, derivatives exact there as asked.
 
         All of them where they are few. With directions D, the exact C along them and H the metric T becomes
         T + (C - T D) (D^T H D)^+ D^T H: of all T' with T' D = C the one that changes least. The other columns stay as
@@ -72,10 +71,10 @@ class Expansion:
         """
         there = self if at.same_as(self.place) else self._around(self._equilibrium(at))
         few = there.model.n_regions + there.model.n_modes <= FEW
-        worth = Derivatives.ALL if few else at.worth
-        if at.directions is None or at.metric is None or worth is Derivatives.KEPT:
+        wanted = Derivatives.ALL if few else at.derivatives
+        if at.directions is None or at.metric is None or wanted is Derivatives.KEPT:
             return there
-        directions = np.eye(len(at.directions)) if worth is Derivatives.ALL else at.directions
+        directions = np.eye(len(at.directions)) if wanted is Derivatives.ALL else at.directions
         before = there.model.derivatives @ directions
         change = there.equilibrium.tangent_along(directions, before) - before
         with determined():
@@ -89,23 +88,23 @@ class Expansion:
         """One right-hand side with the factorisation that is there."""
         return SolveCounts(forward=1)
 
-    def error(self, at: Place) -> ModelError:
+    def error(self, at: LinearisationPoint) -> ModelError:
         """An estimate (see `FiniteStrainEquilibrium.error_estimate`); nothing at its own equilibrium."""
         displacement = self.model.solve(at.moduli, at.coefficients).values
         if at.same_as(self.place):
             return ModelError(0.0, np.zeros_like(displacement))
         return ModelError(*self.equilibrium.error_estimate(at.moduli, at.coefficients, displacement))
 
-    def at_equilibrium(self, at: Place, *, tolerance: float) -> Expansion:
+    def at_equilibrium(self, at: LinearisationPoint, *, tolerance: float) -> Expansion:
         """The expansion around the equilibrium at a place near by, to a tolerance of the forces; `NotConverged`."""
         return self._solved(self.equilibrium.model.to_tolerance(tolerance), at)
 
-    def _solved(self, model: FiniteStrainModel, at: Place) -> Expansion:
+    def _solved(self, model: FiniteStrainModel, at: LinearisationPoint) -> Expansion:
         """The expansion around a model's equilibrium at a place near by; `NotConverged`."""
         start, nearby = self.model.solve(at.moduli, at.coefficients).displacement, self.factorisation
         return self._around(from_start(model, at.moduli, at.coefficients, start=start, nearby=nearby))
 
-    def _equilibrium(self, at: Place) -> FiniteStrainEquilibrium:
+    def _equilibrium(self, at: LinearisationPoint) -> FiniteStrainEquilibrium:
         """The equilibrium at a place, from where the expansion says that it is, else from the present one."""
         before, start = self.equilibrium, self.model.solve(at.moduli, at.coefficients).displacement
         found = before.model.attempt(at.moduli, at.coefficients, start=start, nearby=before.factorisation)
@@ -121,7 +120,9 @@ class Expansion:
         return Expansion(model, there, self.counts + there.counts, self.derivatives_at)
 
 
-def coarse_equilibrium(model: FiniteStrainModel, linear: Approximation, at: Place) -> FiniteStrainEquilibrium:
+def coarse_equilibrium(
+    model: FiniteStrainModel, linear: Approximation, at: LinearisationPoint
+) -> FiniteStrainEquilibrium:
     """The equilibrium near the linear law's displacement at a place, to 3 % of the forces, where an expansion begins.
 
     It keeps no factorisation. Raises `NotConverged` with the element and the share of the motion where the path ended.

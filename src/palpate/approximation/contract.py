@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol, Self
@@ -9,6 +11,7 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.errors import EstimationError
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
 from palpate.mechanics.first_order import FirstOrderModel, expanded
@@ -16,6 +19,19 @@ from palpate.mechanics.forward import ForwardModel, Outputs, SolveCounts
 from palpate.mechanics.linear_model import LinearEquilibrium, LinearModel
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.constraint import Constraint
+
+
+@contextmanager
+def determined() -> Iterator[None]:
+    """Where images and prior leave an unknown open, its matrix has no inverse: raises `EstimationError` for it."""
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(
+            f"the images do not determine what is sought ({error}): beside the noise ([noise] surface_sd_mm, or that of"
+            " the residuals) the driver's motion cannot be told from none; state the noise smaller, or use images in"
+            " which the organs move more"
+        ) from error
 
 
 class LocalModel(ForwardModel, Protocol):
@@ -27,7 +43,7 @@ class LocalModel(ForwardModel, Protocol):
 
 
 class Derivatives(Enum):
-    """Which derivatives are worth making exact at a place, where that has a price."""
+    """Which derivatives are made exact at a place, where that has a price."""
 
     KEPT = "none, those of elsewhere serve"
     DECIDING = "those along the directions that decide the moduli"
@@ -35,21 +51,21 @@ class Derivatives(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class LinearisationPoint:
     """Moduli (n_regions,) kPa and driver coefficients (n_modes,) at which a model is approximated.
 
     directions (n_regions + n_modes, k) of (ln E, q): those along which derivatives are wanted, None where the
-    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there; worth:
-    which exact derivatives are worth their price there.
+    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there;
+    derivatives: which are made exact there.
     """
 
     moduli: NDArray[np.float64]
     coefficients: NDArray[np.float64]
     directions: NDArray[np.float64] | None = None
     metric: NDArray[np.float64] | None = None
-    worth: Derivatives = Derivatives.DECIDING
+    derivatives: Derivatives = Derivatives.DECIDING
 
-    def same_as(self, other: Place | None) -> bool:
+    def same_as(self, other: LinearisationPoint | None) -> bool:
         """Whether moduli and coefficients are those of another place."""
         return (
             other is not None
@@ -94,7 +110,7 @@ class Approximation(Protocol):
         ...
 
     @property
-    def reach(self) -> float:
+    def trust_radius(self) -> float:
         """Distance in ln E from its place within which the approximation is used."""
         ...
 
@@ -103,7 +119,7 @@ class Approximation(Protocol):
         """Moduli (n_regions,) kPa where the derivatives that decide the estimate are exact; None: nowhere yet."""
         ...
 
-    def update(self, at: Place) -> Self:
+    def update(self, at: LinearisationPoint) -> Self:
         """The approximation made exact at a place: the displacement, and the derivatives along its directions.
 
         Raises `NotConverged` when the full model has no equilibrium there, `SolverError` when it cannot be solved.
@@ -115,7 +131,7 @@ class Approximation(Protocol):
         """What one call of `error` costs; an approximation cannot add it to its own `counts`."""
         ...
 
-    def error(self, at: Place) -> ModelError:
+    def error(self, at: LinearisationPoint) -> ModelError:
         """What it misses at a place."""
         ...
 
@@ -130,7 +146,7 @@ class ExactApproximation:
     linear: LinearModel
     finite_strain: FiniteStrainModel | None
     model: FirstOrderModel
-    place: Place
+    place: LinearisationPoint
     equilibrium: LinearEquilibrium | FiniteStrainEquilibrium = field(repr=False)
     counts: SolveCounts
 
@@ -145,7 +161,7 @@ class ExactApproximation:
         return self.equilibrium.factorisation if isinstance(self.equilibrium, FiniteStrainEquilibrium) else None
 
     @property
-    def reach(self) -> float:
+    def trust_radius(self) -> float:
         """As far as an expansion to first order is trusted."""
         return 0.8
 
@@ -154,7 +170,7 @@ class ExactApproximation:
         """Moduli (n_regions,) kPa where the model was last solved: there all derivatives are exact."""
         return self.place.moduli
 
-    def update(self, at: Place) -> ExactApproximation:
+    def update(self, at: LinearisationPoint) -> ExactApproximation:
         """The model solved at a place, and expanded there; raises as `Approximation.update` does."""
         if at.same_as(self.place):
             return self
@@ -165,7 +181,7 @@ class ExactApproximation:
         """One right-hand side with the factorisation that is there."""
         return SolveCounts(forward=1)
 
-    def error(self, at: Place) -> ModelError:
+    def error(self, at: LinearisationPoint) -> ModelError:
         """A bound under the linear law (see `LinearSystem.error_bound`), else an estimate (see `error_estimate`)."""
         displacement = self.model.solve(at.moduli, at.coefficients).values
         if at.same_as(self.place):
@@ -179,7 +195,11 @@ class ExactApproximation:
 
 
 def exact_approximation(
-    linear: LinearModel, finite_strain: FiniteStrainModel | None, at: Place, *, nearby: ExactApproximation | None = None
+    linear: LinearModel,
+    finite_strain: FiniteStrainModel | None,
+    at: LinearisationPoint,
+    *,
+    nearby: ExactApproximation | None = None,
 ) -> ExactApproximation:
     """Solve the model at a place, from an equilibrium `nearby` where there is one; raises as `update` does."""
     before = None if nearby is None else nearby.equilibrium

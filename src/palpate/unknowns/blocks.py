@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion.total_variation import TotalVariation, total_variation
 from palpate.mechanics.material import MaterialModes
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import Observation
 from palpate.observation.prescribed_motion import PrescribedMotion
 from palpate.observation.wall_modes import Wall
+from palpate.unknowns.total_variation import TotalVariation, total_variation
 
 AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
 STILL, MOVES = 0.02, (1.0, 2.0)  # amplitudes of a frame that stands still, times what is stated; of one that moves

@@ -1,7 +1,7 @@
-"""The posterior of all unknowns near an estimate, its closest points and weights held: a quadratic form.
+"""The objective near an estimate with its closest points, weights and hyper-parameters held.
 
-With the closest points, their normals and the robust weights held, every residual is linear in the displacement, and
-the misfit is a quadratic form in the reduced model's amplitudes: an evaluation forgets mesh and surfaces.
+Every residual is then linear in the displacement: a smooth least-squares problem, of which profiles are taken. On a
+reduced model it is a quadratic form in the model's amplitudes: an evaluation forgets mesh and surfaces.
 """
 
 from __future__ import annotations
@@ -13,12 +13,78 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.errors import ConfigurationError
-from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.mechanics.curved import CurvedModel
+from palpate.mechanics.first_order import FirstOrderModel
+from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.reduced import ReducedModel
-from palpate.uncertainty.profile import fixed_correspondence
 
 ONE = np.ones(1)  # the coordinate of what no unknown moves
+
+
+@dataclass(frozen=True, slots=True)
+class FixedCorrespondence:
+    """An objective whose closest points are those of one evaluation; the model bends as it does.
+
+    Residuals are r_0 + S (u(E, q) - u_0) with the smooth Jacobians S by the displacement, and count by the robust
+    weights w_0 there, as in the Gauss-Newton matrix: J = 1/2 sum_j precision w_0j r_j^2 + prior. What re-chosen closest
+    points add, some tenths of a unit, is noise beside its second derivative, and far away a robust loss would take
+    every residual for an outlier. unknowns (n_unknowns,): those of the evaluation; models: of each state, at its
+    observed unknowns; displacements: u_0 (n_dofs,) mm of each line.
+    """
+
+    objective: Objective
+    unknowns: NDArray[np.float64]
+    models: tuple[ForwardModel, ...]
+    lines: tuple[Linearisation, ...]
+    displacements: tuple[NDArray[np.float64], ...]
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of log-moduli among the unknowns."""
+        return self.objective.n_parameters
+
+    def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
+        """J at `unknowns` (n_unknowns,) with gradient and Gauss-Newton matrix; raises `SolverError`."""
+        mapping, lines = self.objective.parameters, list[Linearisation]()
+        left = iter(zip(self.lines, self.displacements, strict=True))
+        moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
+        for s, (state, model, q) in enumerate(zip(self.objective.states, self.models, coefficients, strict=True)):
+            there = model.solve(moduli, q)
+            tangent = mapping.by_unknowns(there.tangent(), unknowns)
+            offset = mapping.offsets(unknowns - self.unknowns, s)
+            for rows, (line, before) in zip(state.slices, left, strict=False):
+                n_dofs, by_offset = len(before), line.jacobian.tangent[len(before), tangent.shape[1] :] @ offset
+                material = line.jacobian.tangent[n_dofs + 1 :] @ (unknowns - self.unknowns)[line.columns]
+                moved = np.concatenate([there.values[rows] - before, [by_offset], material])
+                values = line.residuals.values + line.jacobian.by_displacement @ moved
+                jacobian = line.jacobian.under(tangent[rows])
+                gradient = jacobian.transposed_times(line.precision * line.weights * values)
+                residuals = replace(line.residuals, values=values)
+                lines.append(replace(line, residuals=residuals, jacobian=jacobian, gradient=gradient))
+        found = self.objective.assembled(unknowns, lines)
+        away = float((unknowns - mapping.prior_centre) @ found.prior_score)
+        squares = sum(line.precision * float(line.weights @ line.residuals.values**2) for line in lines)
+        return replace(found, value=0.5 * (away + squares))
+
+
+def fixed_correspondence(
+    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation
+) -> FixedCorrespondence:
+    """The objective with the closest points and weights of an evaluation at `unknowns` (n_unknowns,).
+
+    Expansions bend as the linear law does (`CurvedModel`).
+    """
+    models, displacements = list[ForwardModel](), list[NDArray[np.float64]]()
+    mapping = objective.parameters
+    moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
+    for state, q in zip(objective.states, coefficients, strict=True):
+        model, like = state.observed, state.bending
+        assert model is not None, "an objective is made of states with approximations"
+        values = model.solve(moduli, q).values
+        displacements += [values[rows] for rows in state.slices]
+        models.append(CurvedModel.of(model, like) if like and isinstance(model, FirstOrderModel) else model)
+    return FixedCorrespondence(objective, unknowns, tuple(models), evaluation.linearisations, tuple(displacements))
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +92,14 @@ class FrozenState:
     """One later state: z = [a, q, 1] with the amplitudes a (m,) of its `reduced` model, which answers nothing else.
 
     Offsets of the residuals stand before the 1. expanded (n_regions,) kPa: E_0 where an expansion adds to the model, z
-    = [a, q, ln E - ln E_0, 1]; form: Q (k, k), the misfit is 1/2 z^T Q z.
+    = [a, q, ln E - ln E_0, 1]; form: Q (k, k), the residuals' part of the objective is 1/2 z^T Q z; square: S (k, k),
+    their mean square is z^T S z, mm^2.
     """
 
     reduced: ReducedModel
     expanded: NDArray[np.float64] | None
     form: NDArray[np.float64]
+    square: NDArray[np.float64]
 
     def coordinates(
         self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64], offsets: NDArray[np.float64]
@@ -88,16 +156,17 @@ class FrozenPosterior:
         parameters = self.objective.parameters
         moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
         pull = self.prior @ away
-        value, gradient, matrix = 0.5 * float(away @ pull), pull.copy(), self.prior.copy()
+        value, gradient, matrix, misfit = 0.5 * float(away @ pull), pull.copy(), self.prior.copy(), 0.0
         for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
             offsets, own = parameters.offsets(unknowns, s), parameters.unknowns_of(s)
             z = state.coordinates(moduli, coefficients, offsets)
             slopes = parameters.by_unknowns(state.slopes(moduli, coefficients, len(offsets)), unknowns)
             force = state.form @ z
             value += 0.5 * float(z @ force)
+            misfit += float(z @ (state.square @ z))
             gradient[own] += slopes.T @ force
             matrix[np.ix_(own, own)] += slopes.T @ (state.form @ slopes)
-        return Evaluation(value, np.nan, gradient, gradient, matrix, (), self.prior, pull)
+        return Evaluation(value, misfit, gradient, gradient, matrix, (), self.prior, pull)
 
 
 def frozen_posterior(
@@ -119,7 +188,7 @@ def frozen_posterior(
                 f"the posterior is frozen on reduced models; state {s} has a {type(model).__name__}"
             )
         answer = np.concatenate([reduced.output_basis, reduced.output_modes, reduced.output_material], axis=1)
-        lines = [line for line in evaluation.lines if line.state == s]
+        lines = [line for line in evaluation.linearisations if line.state == s]
         expanded = moduli if any(line.residuals.direct is not None for line in lines) else None
         if expanded is not None:
             answer = np.pad(answer, ((0, 0), (0, len(moduli))))
@@ -129,9 +198,9 @@ def frozen_posterior(
             answer[:, modes] += rest[:, model.n_regions :]
             answer = np.concatenate([answer[:, : modes.stop], rest[:, : model.n_regions]], axis=1)
         offsets = parameters.offsets(unknowns, s)
-        bare = FrozenState(reduced.outputs(lambda values: values[:0]), expanded, np.zeros((0, 0)))
+        bare = FrozenState(reduced.outputs(lambda values: values[:0]), expanded, *(np.zeros((0, 0)),) * 2)
         z = bare.coordinates(moduli, coefficients[s], offsets)
-        form = np.zeros((len(z), len(z)))
+        form, square = np.zeros((len(z), len(z))), np.zeros((len(z), len(z)))
         for rows, line in zip(objective.states[s].slices, lines, strict=True):
             of_offsets = line.jacobian.tangent[:, line.jacobian.shape[1] - len(offsets) :]
             below = np.zeros((len(of_offsets) - len(answer[rows]), answer.shape[1]))
@@ -141,9 +210,10 @@ def frozen_posterior(
                 below[1 + n_regions :, first : first + len(below) - 1 - n_regions] = np.eye(len(below) - 1 - n_regions)
             moved = np.concatenate([np.concatenate([answer[rows], below]), of_offsets], axis=1)
             by_z = replace(line.jacobian, tangent=moved)
-            weights, rest = line.precision * line.weights, line.residuals.values - by_z.times(z[:-1])
-            side = by_z.transposed_times(weights * rest)[:, None]
-            corner = np.array([[float(weights @ rest**2)]])
-            form += np.block([[by_z.gram(weights), side], [side.T, corner]])
-        states.append(replace(bare, form=form))
+            rest = line.residuals.values - by_z.times(z[:-1])
+            side = by_z.transposed_times(line.weights * rest)[:, None]
+            own = np.block([[by_z.gram(line.weights), side], [side.T, float(line.weights @ rest**2)]])
+            form += line.precision * own
+            square += own / len(evaluation.linearisations)
+        states.append(replace(bare, form=form, square=square))
     return FrozenPosterior(objective, tuple(states), evaluation.prior)

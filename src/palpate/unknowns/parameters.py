@@ -11,9 +11,9 @@ from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion.blocks import KNOWN_MODULUS, Acts, Block, in_series, in_series_slopes, joined
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
+from palpate.unknowns.blocks import KNOWN_MODULUS, Acts, Block, in_series, in_series_slopes, joined
 
 LOADS = "the known loads"
 

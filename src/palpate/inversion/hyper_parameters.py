@@ -1,0 +1,317 @@
+"""The hyper-parameters of the objective: how large the residuals' noise is, and how far each block may move.
+
+All are steps on one function (see `Objective`), the residuals linear around the present unknowns. A wall that moves by
+3 mm as one piece must not be allowed to slide by 5 mm on its own: nothing in the images holds it back along itself, and
+the moduli then pay for it. A frame that stands still must not move, a homogeneous tissue not be patchy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, optimize
+
+from palpate.approximation.contract import determined
+from palpate.inversion.objective import (
+    AS_GOOD,
+    Evaluation,
+    Linearisation,
+    Objective,
+    worse_driver,
+)
+from palpate.observation.contract import Observation
+from palpate.observation.noise_model import NoiseModel
+from palpate.unknowns.blocks import Acts, Block
+
+FIRST, ELSEWHERE = 0.3, 0.05  # amplitudes of one term and of the others; one may hide the other
+LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the block's own kernel: no mode is forbidden
+FITTED = 0.5  # of a kind's residuals, the largest share that is taken for fitted by the unknowns
+
+
+def with_first_noise(objective: Objective) -> Objective:
+    """The objective before any residual is seen: all count by the noise that each kind begins with in its image."""
+    seen = [(s, o, state.observations) for s, state in enumerate(objective.states) for o in state.observations]
+    noise = {(s, o.kind): o.first_noise([p for p in peers if p.kind == o.kind]) for s, o, peers in seen}
+    return _of_each(objective, lambda s, o: o.with_noise(noise[s, o.kind]))
+
+
+def with_correlations(objective: Objective, evaluation: Evaluation) -> Objective:
+    """The objective with the numbers of independent residuals that those of an evaluation tell; their scales stay."""
+    noise = fitted_noise(evaluation)
+    return _of_each(objective, lambda s, o: o.with_correlation(noise[s, o.kind]))
+
+
+def with_hyper_parameters(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
+    """A step of the hyper-parameters at unknowns (n_unknowns,), the residuals linear around their evaluation.
+
+    Raises `EstimationError` where the images leave a block's motion open.
+    """
+    learned = with_amplitudes(with_scales(objective, evaluation), evaluation, unknowns)
+    return with_edges(learned, evaluation, unknowns)
+
+
+def with_scales(objective: Objective, evaluation: Evaluation) -> Objective:
+    """The scales s with the least objective, one of each kind and later image, and of a driver no smaller one.
+
+    d/d ln s of 1/2 ln det H is -g, g = tr H^-1 J^T W J the number of unknowns that the residuals determine (MacKay
+    1992): s^2 = n rho / (n - g) of a mean square rho where no outlier is.
+    """
+    lines, found, inverse = evaluation.linearisations, dict[int, float](), np.zeros_like(evaluation.matrix)
+    matrix = evaluation.matrix - evaluation.prior + objective.as_normal(evaluation)[0]
+    seen = np.flatnonzero(np.diag(matrix) > 0.0)
+    with determined():
+        inverse[np.ix_(seen, seen)] = np.linalg.inv(matrix[np.ix_(seen, seen)])
+    for own, telling in of_one_noise(evaluation).values():
+        pooled = _scale([lines[i] for i in telling], inverse, 0.0)
+        apart = [i for i in own if i not in telling]
+        found |= dict.fromkeys(own, pooled) | {i: _scale([lines[i]], inverse, pooled) for i in apart}
+    pairs = enumerate(objective.observations)
+    return objective.with_observations([o.with_sd(found[i]) for i, o in pairs])
+
+
+def _scale(lines: Sequence[Linearisation], inverse: NDArray[np.float64], least: float) -> float:
+    """That of some observations' residuals, mm, at least `least`; inverse (n, n): H^-1."""
+    count = sum(line.observation.weighting.count for line in lines)
+    determine = 0.0
+    for line in lines:
+        gram = line.jacobian.gram(line.precision * line.weights)
+        determine += float(np.sum(inverse[np.ix_(line.columns, line.columns)] * gram))
+    low = max(least, *(line.observation.sd_bounds[0] for line in lines))
+    high = min(line.observation.sd_bounds[1] for line in lines)
+    if high <= low:
+        return low
+    determine = min(determine, FITTED * count)
+
+    def worse(log_sd: float) -> float:
+        """What the objective has of it at ln s."""
+        total = -determine * log_sd
+        for line in lines:
+            weighting = line.observation.with_sd(float(np.exp(log_sd))).weighting
+            rho = float(line.residuals.weights @ weighting.loss.rho(line.residuals.values))
+            total += 0.5 * weighting.precision * rho + weighting.log_normaliser
+        return total if least == 0.0 else total + worse_driver(float(np.exp(log_sd)), least)
+
+    now = float(np.log(lines[0].observation.weighting.sd))
+    ends = (max(np.log(low), now - 4.0), min(np.log(high), now + 4.0))
+    if ends[1] <= ends[0]:
+        return float(np.clip(np.exp(now), low, high))
+    best = optimize.minimize_scalar(worse, bounds=ends, method="bounded", options={"xatol": 1e-5})
+    return float(np.exp(best.x)) if best.fun < worse(ends[0]) else float(np.exp(ends[0]))
+
+
+def fitted_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
+    """Noise model by later state and kind of observation, of the residuals that tell (see `of_one_noise`).
+
+    Each later image has its own: one that was drawn badly would else take from what the others are believed.
+    """
+    lines, groups = evaluation.linearisations, of_one_noise(evaluation)
+    telling = {key: [lines[i] for i in those] for key, (_, those) in groups.items()}
+    return {key: of[0].observation.fitted_noise([line.residuals for line in of]) for key, of in telling.items()}
+
+
+def of_one_noise(evaluation: Evaluation) -> dict[tuple[int, str], tuple[list[int], list[int]]]:
+    """Numbers of the observations of each later state and kind, which share a noise model; of those that tell of it.
+
+    Modes flatten a driver's residuals: they tell where nothing else is seen.
+    """
+    groups: dict[tuple[int, str], tuple[list[int], list[int]]] = {}
+    for i, line in enumerate(evaluation.linearisations):
+        own, telling = groups.setdefault((line.state, line.observation.kind), ([], []))
+        own.append(i)
+        telling += [] if line.observation.of_driver else [i]
+    return {key: (own, telling or own) for key, (own, telling) in groups.items()}
+
+
+def _of_each(objective: Objective, change: Callable[[int, Observation], Observation]) -> Objective:
+    return objective.with_observations(
+        [change(s, o) for s, state in enumerate(objective.states) for o in state.observations]
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What the data say of one block when all else follows: information A (n, n) and pull b = A x - J^T W r (n,)."""
+
+    information: NDArray[np.float64]
+    pull: NDArray[np.float64]
+
+    def log_evidence(
+        self, terms: Sequence[NDArray[np.float64]], variances: NDArray[np.float64]
+    ) -> tuple[float, NDArray[np.float64]]:
+        """F = 1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) for C = sum_t v_t C_t, and dF / d v_t (n_terms,).
+
+        With x = (A + C^-1)^-1 b, w = b - A x and G = A (1 + C A)^-1 the derivative is 1/2 (w^T C_t w - tr C_t G).
+        """
+        covariance = sum((v * term for v, term in zip(variances, terms, strict=True)), np.zeros_like(terms[0]))
+        inner = covariance @ self.information
+        inner[np.diag_indices_from(inner)] += 1.0
+        factor = linalg.lu_factor(inner, overwrite_a=True, check_finite=False)
+        x = linalg.lu_solve(factor, covariance @ self.pull, check_finite=False)
+        left = self.pull - self.information @ x
+        determinant = float(np.sum(np.log(np.abs(np.diag(factor[0])))))
+        response = linalg.lu_solve(factor, self.information.T, trans=1, check_finite=False)  # G^T
+        slopes = [0.5 * float(left @ term @ left - np.sum(term * response)) for term in terms]
+        return 0.5 * float(self.pull @ x) - 0.5 * determinant, np.array(slopes)
+
+
+def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
+    """The objective with the blocks' alternatives and amplitudes of the largest evidence, block after block.
+
+    With A = J^T W J and b = A x - J^T W r at unknowns x (n_unknowns,) the log-evidence of P is 1/2 (b^T (A + P)^-1 b -
+    ln det(A + P) + ln det P) up to a constant (MacKay 1992, Neural Computation 4, 415-447, section 4), the other blocks
+    under their present prior. An alternative stays until another one is more than as good; of a material the first one.
+    """
+    parameters, n = objective.parameters, objective.n_parameters
+    chosen = list(objective.chosen or (None,) * len(parameters.blocks))
+    data, prior = evaluation.matrix - evaluation.prior, evaluation.prior.copy()
+    pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
+    for i, block in enumerate(parameters.blocks):
+        if not block.alternatives or (block.last and not objective.learn_last):
+            continue
+        places = parameters.columns(i)
+        beliefs = _beliefs(block, places, data, prior, pull + prior @ parameters.prior_centre)
+        best, present = max(range(len(beliefs)), key=lambda k: beliefs[k][0]), chosen[i]
+        if present is None and block.acts is Acts.MATERIAL:
+            present = 0
+        if present is None or beliefs[best][0] > beliefs[present][0] + AS_GOOD:
+            present = best
+        chosen[i] = present
+        with determined():
+            prior[np.ix_(places, places)] = linalg.inv(beliefs[present][1])
+    parameters = replace(parameters, nuisance_precision=prior[n:, n:])
+    return replace(objective, parameters=parameters, chosen=tuple(chosen))
+
+
+def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
+    """The objective whose blocks of a total variation have the normal law that is it to second order.
+
+    Where, with the residuals linear around unknowns (n_unknowns,), the block's x is likeliest, block after block, the
+    others following: with the gradient g and the curvature H there of minus the logarithm of what is believed, N(x -
+    H^-1 g, H^-1). The minimum is that of the variation itself, and its posterior Laplace's.
+    """
+    parameters, n = objective.parameters, objective.n_parameters
+    numbers = [i for i, block in enumerate(parameters.blocks) if block.variation]
+    if not numbers:
+        return objective
+    prior, centre = parameters.prior_matrix, parameters.prior_centre
+    data = evaluation.matrix - evaluation.prior
+    pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
+    for i in numbers:
+        places, variation = parameters.columns(i), parameters.blocks[i].variation
+        assert variation is not None
+        centre[places] = 0.0
+        with determined():
+            seen = _seen(data + prior, data, pull + prior @ centre, places)
+            x = variation.least(seen.information, seen.pull, unknowns[places])
+            prior[np.ix_(places, places)] = curvature = variation.curvature(x)
+            away = linalg.solve(curvature, variation.gradient(x), assume_a="pos")
+        centre[places] = x - away
+    believed = replace(parameters, nuisance_precision=prior[n:, n:], nuisance_mean=centre[n:])
+    return replace(objective, parameters=believed)
+
+
+def undecided_covariance(
+    objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
+    """What a covariance (n_parameters, n_parameters) lacks where alternatives were not decided, by the blocks' cause.
+
+    The second moment about the estimate of a mixture: sum_k w_k (V_k - V + d_k d_k^T) over the alternatives of a block
+    that were not chosen, with their posterior probability w_k by evidence and odds, the Gauss-Newton covariance V_k
+    of the log-moduli under each, and how far d_k it moves them, with the residuals linear around unknowns (n_unknowns,)
+    (law of total variance).
+    """
+    parameters, n = objective.parameters, objective.n_parameters
+    data, prior = evaluation.matrix - evaluation.prior, evaluation.prior
+    centre = parameters.prior_centre
+    pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
+
+    def posterior(of: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Mean (n,) and covariance (n, n) of the log-moduli under a prior's precision."""
+        right = np.column_stack([np.eye(len(of))[:, :n], pull + of @ centre])
+        solved = linalg.solve(data + of, right, assume_a="pos", check_finite=False)
+        return solved[:n, n], solved[:n, :n]
+
+    found = dict[str, NDArray[np.float64]]()
+    with determined():
+        mean, covariance = posterior(prior)
+        for i, block in enumerate(parameters.blocks):
+            if not block.odds:
+                continue
+            places = parameters.columns(i)
+            beliefs = _beliefs(block, places, data, prior, pull + prior @ centre)
+            chosen = (objective.chosen[i] if objective.chosen else None) or 0
+            evidences = np.array([evidence for evidence, _ in beliefs])
+            shares = np.exp(evidences - evidences.max())
+            shares /= shares.sum()
+            part = np.zeros((n, n))
+            for k, (_, believed) in enumerate(beliefs):
+                if k == chosen:
+                    continue
+                other = prior.copy()
+                other[np.ix_(places, places)] = linalg.inv(believed)
+                moved, spread = posterior(other)
+                part += shares[k] * (spread - covariance + np.outer(moved - mean, moved - mean))
+            sizes, axes = np.linalg.eigh(part)  # an alternative that knows more makes nothing narrower
+            found[block.cause] = found.get(block.cause, np.zeros((n, n))) + (axes * np.maximum(sizes, 0.0)) @ axes.T
+    return found
+
+
+def _beliefs(
+    block: Block,
+    places: NDArray[np.int64],
+    data: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    pull: NDArray[np.float64],
+) -> list[tuple[float, NDArray[np.float64]]]:
+    """Log-evidence and covariance (n, n) of each alternative of a block at its best, all others under their prior.
+
+    data, prior: information and precision (n_unknowns, n_unknowns); pull (n_unknowns,): of data and prior means.
+    """
+    with determined():
+        seen = _seen(data + prior, data, pull, places)
+        odds = block.odds or (0.0,) * len(block.alternatives)
+        return [_most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)]
+
+
+def _seen(
+    matrix: NDArray[np.float64], data: NDArray[np.float64], pull: NDArray[np.float64], places: NDArray[np.int64]
+) -> _Seen:
+    """The Schur complement of the information `data` on the unknowns `places`, the others under their prior.
+
+    matrix (n, n): the data's and the prior's; pull (n,): likewise, with the prior's mean.
+    """
+    rest = np.setdiff1d(np.arange(len(pull)), places)
+    across = data[np.ix_(rest, places)]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix)[rest], 1e-30))
+    scaled = scale[:, None] * matrix[np.ix_(rest, rest)] * scale
+    scaled[np.diag_indices_from(scaled)] += 1e-10  # a modulus that moves nothing
+    right = scale[:, None] * np.column_stack([across, pull[rest]])
+    followed = across.T @ (scale[:, None] * linalg.solve(scaled, right, assume_a="pos", check_finite=False))
+    information = data[np.ix_(places, places)] - followed[:, :-1]
+    return _Seen(0.5 * (information + information.T), pull[places] - followed[:, -1])
+
+
+def _most_evident(
+    terms: Sequence[NDArray[np.float64]], seen: _Seen, block: Block, odds: float
+) -> tuple[float, NDArray[np.float64]]:
+    """The largest log-evidence, with its log prior odds, of a family of priors of a block; its covariance (n, n)."""
+    floored = [term + LEAST_VARIANCE * np.eye(len(term)) for term in terms]
+
+    def worse(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Minus the log-evidence at ln of the amplitudes (n_terms,), with its derivative."""
+        squares = np.exp(2.0 * logs)
+        evidence, slopes = seen.log_evidence(floored, squares)
+        return -evidence, -2.0 * squares * slopes
+
+    limits = np.log(block.amplitudes)
+    starts = np.log(np.where(np.eye(len(terms)) > 0.0, FIRST, ELSEWHERE)).clip(*limits)
+    found = [
+        optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=[tuple(limits)] * len(terms))
+        for start in starts
+    ]
+    best = min(found, key=lambda trial: float(trial.fun))
+    squares = np.exp(2.0 * best.x)
+    return odds - float(best.fun), sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))

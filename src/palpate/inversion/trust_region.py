@@ -1,0 +1,359 @@
+"""The loop that lowers the objective: linearise the model, minimise over unknowns and hyper-parameters, accept, repeat.
+
+It is the same for the linear and for a finite-strain law, and for every approximation of the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.approximation.contract import Derivatives
+from palpate.errors import NotConverged
+from palpate.inversion.hyper_parameters import with_correlations, with_hyper_parameters
+from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
+from palpate.inversion.optimise import (
+    BAD,
+    TRIALS,
+    Bounds,
+    Iterate,
+    Minimum,
+    Outcome,
+    TrustRegion,
+    gauss_newton,
+    newton_decrement,
+    posterior_sd,
+)
+from palpate.mechanics.forward import SolveCounts
+from palpate.observation.contract import seen_by
+from palpate.progress import silent
+
+NOISE = 0.5  # of the objective: that of closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
+INNER = 1e-4  # decrement of a minimum on linear residuals
+SETTLES = 6  # iterations, after which numbers of independent residuals stay, and the trust region no longer grows
+SLOW = 0.5  # of the model's error an iteration before: where more is left all derivatives are made exact
+LEAST_SD = 0.03  # of ln E, see `_linearisation`
+
+
+class Criterion(StrEnum):
+    """What must hold for an estimate to end; the value is what the user reads where it does not."""
+
+    STEP = "the estimate still moves"
+    LINEARISATION = "the estimate still moves where the model is linearised anew"
+    MODEL_ERROR = "the model that stands in for the full one is not exact enough where the estimate lies"
+
+
+@dataclass(frozen=True, slots=True)
+class Convergence:
+    """What an iteration left open, each over its tolerance: converged where none exceeds 1."""
+
+    step: float = np.inf
+    linearisation: float = np.inf
+    model_error: float = np.inf
+
+    @property
+    def unmet(self) -> tuple[Criterion, ...]:
+        """The criteria that do not hold."""
+        return tuple(c for c in Criterion if getattr(self, c.name.lower()) >= 1.0)
+
+    @property
+    def converged(self) -> bool:
+        """Whether all hold."""
+        return not self.unmet
+
+
+@dataclass(frozen=True, slots=True)
+class StopRule:
+    """When an estimate ends, in its own posterior standard deviations.
+
+    step_sd, floor: a log-modulus may still move by so many of its standard deviations, or by `floor` (of ln E) where
+    that is more; coefficients: the decrement a coefficient that may be left; model_error: share of the tolerance by
+    which what the approximation misses may set it off, inf: none is asked for; derivatives: whether those that decide
+    the moduli must be exact so near; learn: whether hyper-parameters are sought, too; correlate: whether the
+    numbers of independent residuals are taken anew; iterations: the largest number.
+    """
+
+    step_sd: float = 0.02
+    floor: float = 3e-4
+    coefficients: float = np.inf
+    model_error: float = 1.0
+    derivatives: bool = True
+    learn: bool = True
+    correlate: bool = True
+    iterations: int = 25
+
+    def tolerance(self, minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
+        """By how much each log-modulus (n_parameters,) may still move."""
+        if np.isinf(self.step_sd):
+            return np.full(n_parameters, np.inf)
+        return np.maximum(self.step_sd * posterior_sd(minimum, n_parameters), self.floor)
+
+
+@dataclass(frozen=True, slots=True)
+class OuterIterate:
+    """Where an iteration ended: a minimum under the objective that it was found with.
+
+    checks: what it cost to state the approximations' errors; totals: J before and after each accepted step, by one
+    linearisation's determinants; exact: whether the approximations were made exact there;
+    correlated: how often the numbers of independent residuals have been taken anew.
+    """
+
+    objective: Objective
+    minimum: Minimum
+    convergence: Convergence = Convergence()
+    checks: SolveCounts = field(default_factory=SolveCounts)
+    totals: tuple[tuple[float, float], ...] = ()
+    exact: bool = False
+    correlated: int = 0
+
+    @property
+    def counts(self) -> SolveCounts:
+        """What the full model has cost: to make the approximations, and to state their errors."""
+        return sum((approximation.counts for approximation in self.objective.approximations), self.checks)
+
+
+def begun(objective: Objective, unknowns: NDArray[np.float64]) -> OuterIterate:
+    """Where a loop begins: an objective matched, and evaluated, at unknowns (n_unknowns,)."""
+    objective = objective.rematched(unknowns)
+    return OuterIterate(objective, Minimum(unknowns, objective(unknowns), Outcome.STEPS, (), 1))
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """A minimum on linear residuals: unknowns, the hyper-parameters there, J at both ends; cut: by the trust region.
+
+    begin: the evaluation where it begins, under these hyper-parameters.
+    """
+
+    objective: Objective
+    minimum: Minimum
+    begin: Evaluation
+    now: float
+    then: float
+    cut: bool
+
+    def reductions(self, unknowns: NDArray[np.float64], judged: Evaluation) -> tuple[float, float]:
+        """By how much J falls on a way from unknowns (n,) to where it is `judged`, and on linear residuals.
+
+        By the scores at both ends, -1/2 (s + s')^T d: closest points that slide over voxels are noise of J, as large as
+        what moduli promise, that the score, by the smooth Jacobians, does not have.
+        """
+        d = self.minimum.unknowns - unknowns
+        ends = judged.score, self.minimum.evaluation.score
+        gain, promised = (-0.5 * float((self.begin.score + end) @ d) for end in ends)
+        return gain, promised
+
+
+def minimised(
+    start: OuterIterate,
+    bounds: Bounds,
+    rule: StopRule,
+    *,
+    progress: Callable[[str], None],
+    title: str,
+    fixed: bool = False,
+) -> OuterIterate:
+    """Lower the objective from `start` until a stop rule is met.
+
+    fixed: whether the log-moduli stay. `title` begins each line of `progress`. The minimum's history is that of the
+    loop alone, its evaluations are added to those of `start`. Raises `NotConverged` when the full model has no
+    equilibrium where every trial leads.
+    """
+    at, n = start.minimum.evaluation, start.objective.n_parameters
+    first = Iterate(start.minimum.unknowns[:n], at.value, at.misfit_mm2, newton_decrement(at))
+    begin = replace(start.minimum, history=(first,), outcome=Outcome.STEPS)
+    now = replace(start, minimum=begin, totals=(), correlated=0)
+    del start
+    region = TrustRegion()
+    for number in range(1, rule.iterations + 1):
+        line = f"{title}, iteration {number}"
+        lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
+        progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}{lowered}")
+        now, region = _iteration(now, bounds, rule, region, fixed, grows=number <= SETTLES)
+        if now.minimum.outcome is Outcome.STUCK:
+            break
+        if now.convergence.converged:
+            wider = replace(now.objective, learn_last=True)
+            if now.objective.learn_last or not rule.learn or not any(b.last for b in wider.parameters.blocks):
+                now = replace(now, minimum=replace(now.minimum, outcome=Outcome.CONVERGED))
+                break
+            learned = with_hyper_parameters(wider, now.minimum.evaluation, now.minimum.unknowns)
+            now = replace(now, objective=wider)
+            if learned.chosen == wider.chosen:
+                now = replace(now, minimum=replace(now.minimum, outcome=Outcome.CONVERGED))
+                break
+    return now
+
+
+def fit_coefficients(objective: Objective, begin: NDArray[np.float64], *, bounds: Bounds) -> Minimum:
+    """The best coefficients of the blocks at the log-moduli of `begin` (n_unknowns,), sought from there.
+
+    To a fifth of their standard deviations each, in the mean.
+    """
+    rule = StopRule(step_sd=np.inf, coefficients=0.02, model_error=np.inf, derivatives=False, learn=False)
+    return minimised(begun(objective, begin), bounds, rule, progress=silent, title="coefficients", fixed=True).minimum
+
+
+def _iteration(
+    now: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, fixed: bool, *, grows: bool
+) -> tuple[OuterIterate, TrustRegion]:
+    """One accepted step, or `STUCK` where none of some trials is; the region for the next, and whether it may grow."""
+    n, before = now.objective.n_parameters, now.minimum
+    failure, trial_evaluations = None, 0
+    for _ in range(TRIALS):
+        step = _linear_minimum(now, bounds, rule, region, fixed)
+        moved = np.abs(step.minimum.unknowns - before.unknowns)
+        longest = float(np.max(moved[:n], initial=0.0))
+        try:
+            there, judged, spent = _evaluated(step, now, rule)
+        except NotConverged as error:
+            failure, region = error, region.smaller(longest)
+            continue
+        failure, trial_evaluations = None, trial_evaluations + spent
+        then = step.then + judged.value - step.minimum.evaluation.value
+        gain, promised = step.reductions(before.unknowns, judged)
+        if (gain + NOISE) / (promised + NOISE) > BAD:
+            region = region.after(gain / max(promised, 1e-9), longest, grows=grows)
+            end = there.minimum
+            seen, spent = end.evaluation, before.evaluations + trial_evaluations
+            arrived = Iterate(end.unknowns[:n], seen.value, seen.misfit_mm2, newton_decrement(seen))
+            end = replace(end, history=(*before.history, arrived), evaluations=spent)
+            totals = (*now.totals, (step.now, then))
+            return replace(there, minimum=end, totals=totals), region
+        region = region.smaller(longest)
+    if failure is not None:
+        raise failure
+    spent = before.evaluations + trial_evaluations
+    return replace(now, minimum=replace(before, outcome=Outcome.STUCK, evaluations=spent)), region
+
+
+def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, fixed: bool) -> _Step:
+    """Unknowns and hyper-parameters with the least objective on residuals linear around a minimum so far.
+
+    In turn, each of which lowers it: unknowns under given hyper-parameters, and these (see `with_hyper_parameters`).
+    Where the step is damped hyper-parameters stay. So do the numbers of independent residuals where the trust region,
+    and no bound, ends the step, for what is still motion is alike over whole surfaces; and once they have been taken
+    anew some times.
+    """
+    objective, at, n = start.objective, start.minimum, start.objective.n_parameters
+    trusted = [state.approximation.trust_radius for state in objective.states if state.approximation]
+    theta, reach = at.unknowns[:n], min([region.radius, *trusted])
+    near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
+    damping = region.damping
+    linear = LinearisedObjective(objective, at.unknowns, at.evaluation, damping)
+    within = 0.05 * rule.tolerance(at, n)
+    found = gauss_newton(linear, at.unknowns, bounds=near, fixed=fixed, tolerance=INNER, within=within)
+    found = found if not damping else replace(found, evaluation=replace(linear, damping=0.0)(found.unknowns))
+    cut = damping > 0.0 or (not fixed and _cut_short(found.unknowns[:n], near, bounds))
+    if damping or not rule.learn:
+        ends = objective.total(at.evaluation), objective.total(found.evaluation)
+        return _Step(objective, found, at.evaluation, *ends, cut)
+    now, total = objective.total(at.evaluation), objective.total(found.evaluation)
+    if rule.correlate and not cut and start.correlated < SETTLES:
+        objective = with_correlations(objective, found.evaluation)
+        plain = LinearisedObjective(objective, at.unknowns, at.evaluation)
+        found = replace(found, evaluation=plain(found.unknowns))
+        now, total = objective.total(plain(at.unknowns)), objective.total(found.evaluation)
+    for _ in range(rule.iterations):
+        learned = with_hyper_parameters(objective, found.evaluation, found.unknowns)
+        linear = LinearisedObjective(learned, at.unknowns, at.evaluation)
+        again = gauss_newton(linear, found.unknowns, bounds=near, fixed=fixed, tolerance=INNER, within=within)
+        lower = learned.total(again.evaluation)
+        if lower > total:
+            break
+        moved = np.abs(again.unknowns - found.unknowns)[:n] / rule.tolerance(again, n)
+        change, objective, found, total = total - lower, learned, again, lower
+        if np.all(moved < 0.1) and change < 0.01:
+            break
+    begin = LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns)
+    return _Step(objective, found, begin, now, total, cut)
+
+
+def _cut_short(theta: NDArray[np.float64], near: Bounds, bounds: Bounds) -> bool:
+    """Whether the trust region, and no bound of the search, holds a log-modulus back."""
+    low, high = (theta <= near.lower) & (near.lower > bounds.lower), (theta >= near.upper) & (near.upper < bounds.upper)
+    return bool(np.any(low | high))
+
+
+def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIterate, Evaluation, int]:
+    """The objective at the end of a step, its model made exact there where its error matters.
+
+    With it the evaluation by which the step is judged: on the model that the step began with, but where that was exact,
+    on one that is exact at both ends; and the evaluations spent.
+    """
+    n, unknowns = step.objective.n_parameters, step.minimum.unknowns
+    objective = step.objective.rematched(unknowns)
+    minimum, spent = replace(step.minimum, evaluation=objective(unknowns), outcome=Outcome.STEPS), 1
+    tolerance = rule.tolerance(minimum, n)
+    moved = np.abs(unknowns - now.minimum.unknowns)[:n]
+    size = float(np.max(moved / tolerance, initial=0.0))
+    if step.cut and newton_decrement(now.minimum.evaluation) > NOISE:
+        size = max(size, 1.0)  # the trust region holds back what the noise of the objective does not hide
+    wanted = size
+    if np.isfinite(rule.coefficients):
+        decrement = newton_decrement_of(now.minimum, unknowns)
+        wanted = max(0.0 if np.isinf(rule.step_sd) else size, decrement / (rule.coefficients * len(unknowns)))
+    correlated = now.correlated + (rule.learn and not step.cut)
+    if np.isinf(rule.model_error):
+        there = OuterIterate(objective, minimum, Convergence(wanted, 0.0, 0.0), now.checks, now.totals)
+        return replace(there, correlated=correlated), minimum.evaluation, spent
+    _, off, cost = model_error(objective, minimum)
+    missing = float(np.max(off / (rule.model_error * tolerance), initial=0.0))
+    left = float(np.max(_linearisation(objective, minimum) / tolerance, initial=0.0)) if rule.derivatives else 0.0
+    checks, matters = now.checks + cost, max(missing, left) >= 1.0
+    judged = minimum.evaluation
+    if matters:
+        slow = missing >= 1.0 and missing > SLOW * now.convergence.model_error
+        derivatives = Derivatives.ALL if slow else Derivatives.DECIDING
+        places = objective.linearisation_points(unknowns, minimum.evaluation, derivatives)
+        pairs = zip(objective.approximations, places, strict=True)
+        objective = objective.under([approximation.update(place) for approximation, place in pairs])
+        minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
+    there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals, exact=matters)
+    return replace(there, correlated=correlated), judged, spent
+
+
+def newton_decrement_of(before: Minimum, unknowns: NDArray[np.float64]) -> float:
+    """Half of the squared length of a step from a minimum to unknowns (n,), by the Gauss-Newton matrix there."""
+    step = unknowns - before.unknowns
+    return 0.5 * float(step @ before.evaluation.matrix @ step)
+
+
+def _linearisation(objective: Objective, there: Minimum) -> NDArray[np.float64]:
+    """How far (n_parameters,), of ln E, derivatives that are exact elsewhere may set an estimate off.
+
+    At a distance d of ln E they are off by a share d, and so is what the residuals pull with them, which is worth a
+    posterior standard deviation: d sd, d the largest of all log-moduli; infinite where they are exact nowhere yet. A
+    standard deviation counts as 0.03 at least: its own error is a share d, too, and may be a per cent.
+    """
+    moduli, distance = objective.parameters.moduli(there.unknowns), 0.0
+    for approximation in objective.approximations:
+        exact = approximation.derivatives_at
+        distance = np.inf if exact is None else max(distance, float(np.abs(np.log(moduli / exact)).max()))
+    return distance * np.maximum(posterior_sd(there, objective.n_parameters), LEAST_SD)
+
+
+def model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray[np.float64], SolveCounts]:
+    """What the approximations miss at a minimum: the largest error in energy, and what it cost to know.
+
+    Between them by how much it sets the log-moduli off (n_parameters,): |H^-1 J^T W S du|, with the displacement du
+    that is missing, the residuals' smooth derivatives S by it and the Gauss-Newton matrix H = J^T W J + P; infinite
+    where an approximation cannot say.
+    """
+    pairs = list(zip(objective.approximations, objective.linearisation_points(minimum.unknowns), strict=True))
+    cost = sum((approximation.error_counts for approximation, _ in pairs), SolveCounts())
+    errors = [approximation.error(at) for approximation, at in pairs]
+    largest = max(error.relative for error in errors)
+    if not np.isfinite(largest):
+        return np.inf, np.full(objective.n_parameters, np.inf), cost
+    pull = np.zeros(len(minimum.unknowns))
+    for line in minimum.evaluation.linearisations:
+        du = seen_by(line.observation, errors[line.state].missing)
+        missing = np.asarray(line.residuals.smooth_jacobian @ du)
+        pull[line.columns] += line.jacobian.transposed_times(line.precision * line.weights * missing)
+    off = np.abs(minimum.evaluation.covariance_columns(objective.n_parameters).T @ pull)
+    return largest, np.asarray(off), cost

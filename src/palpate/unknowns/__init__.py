@@ -1,0 +1,19 @@
+"""What is sought, and what is believed of it before the images are seen: log-moduli, and blocks of further unknowns."""
+
+from palpate.unknowns.blocks import FIELD as FIELD
+from palpate.unknowns.blocks import KNOWN_MODULUS as KNOWN_MODULUS
+from palpate.unknowns.blocks import Acts as Acts
+from palpate.unknowns.blocks import Block as Block
+from palpate.unknowns.blocks import frame_blocks as frame_blocks
+from palpate.unknowns.blocks import instrument_block as instrument_block
+from palpate.unknowns.blocks import known_modulus_blocks as known_modulus_blocks
+from palpate.unknowns.blocks import layer_blocks as layer_blocks
+from palpate.unknowns.blocks import material_blocks as material_blocks
+from palpate.unknowns.blocks import offset_block as offset_block
+from palpate.unknowns.blocks import unit_blocks as unit_blocks
+from palpate.unknowns.blocks import wall_blocks as wall_blocks
+from palpate.unknowns.parameters import ParameterMap as ParameterMap
+from palpate.unknowns.parameters import eta_of_ratio as eta_of_ratio
+from palpate.unknowns.parameters import parameter_map as parameter_map
+from palpate.unknowns.parameters import ratio_of_eta as ratio_of_eta
+from palpate.unknowns.total_variation import TotalVariation as TotalVariation

@@ -1,0 +1,266 @@
+"""One loop lowers one objective: whatever the way, the approximation and the noise of closest points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.approximation import LinearisationPoint, exact_approximation, reduced_basis
+from palpate.approximation.contract import ModelError
+from palpate.errors import NotConverged
+from palpate.inversion import (
+    LinearisedObjective,
+    Objective,
+    Outcome,
+    StopRule,
+    begun,
+    fit_coefficients,
+    invert,
+    minimised,
+    posterior_sd,
+    trust_region,
+    with_first_noise,
+)
+from palpate.inversion.optimise import RADIUS, TRIALS
+from palpate.inversion.trust_region import Convergence, Criterion
+
+CHEAP = StopRule(model_error=np.inf, derivatives=False)
+
+
+@pytest.fixture(scope="module")
+def found(twins, voxels):
+    return invert(voxels, twins.settings(0.5), progress=twins.silent)
+
+
+def end_of(found):
+    return found.candidates[found.best].iterate
+
+
+def moved(one, other, rule=None):
+    """How far two minima are apart, over the stop rule's tolerance."""
+    tolerance = (rule or StopRule()).tolerance(other, 2)
+    return float(np.max(np.abs(one.unknowns - other.unknowns)[:2] / tolerance))
+
+
+def on(found, objective, twins, rule=None, **changes):
+    """The loop from where an estimate ended, on another objective."""
+    start = replace(begun(objective, found.minimum.unknowns), **changes)
+    return minimised(start, twins.settings(0.5).bounds, rule or StopRule(), progress=twins.silent, title="")
+
+
+@pytest.mark.parametrize("ratio", [1.0, 3.0, 20.0])
+def test_the_way_to_the_estimate_does_not_show(twins, voxels, found, ratio):
+    """Two ways, each to the tolerance; the hyper-parameters end alike, too."""
+    other = invert(voxels, twins.settings(ratio), progress=twins.silent)
+    assert other.convergence.converged
+    assert moved(other.minimum, found.minimum) < 2.0
+    scales = [[o.weighting.sd for o in f.objective.observations] for f in (found, other)]
+    assert scales[0] == pytest.approx(scales[1], rel=5e-3)
+
+
+def test_no_accepted_step_raises_the_objective(twins, voxels):
+    """But for the noise of closest points; most steps lower it."""
+    for ratio in (0.2, 30.0):
+        end = end_of(invert(voxels, twins.settings(ratio), progress=twins.silent))
+        steps = np.array(end.totals)
+        assert len(steps) > 1
+        assert np.all(steps[:, 1] < steps[:, 0] + trust_region.NOISE)
+
+
+def test_where_it_ends_the_objective_is_least_along_every_log_modulus(found):
+    """With all other unknowns and the hyper-parameters at their best on linear residuals."""
+    end = end_of(found)
+    linear = LinearisedObjective(end.objective, end.minimum.unknowns, end.minimum.evaluation)
+    here = linear(end.minimum.unknowns)
+    shift = np.linalg.solve(here.matrix, here.score)
+    assert np.all(np.abs(shift[:2]) < 0.1 * posterior_sd(found.minimum, 2))
+
+
+def test_going_on_from_the_estimate_changes_nothing(twins, found):
+    again = on(found, found.objective, twins)
+    assert again.minimum.converged
+    assert moved(again.minimum, found.minimum) < 1.0
+
+
+def test_the_full_model_finds_the_same_where_the_reduced_one_stands(twins, twin, found):
+    """All derivatives of the full model exact at every place."""
+    place = LinearisationPoint(found.objective.parameters.moduli(found.minimum.unknowns), found.minimum.unknowns[2:])
+    end = on(found, found.objective.under([exact_approximation(twin.model, None, place)]), twins, exact=True)
+    assert end.minimum.converged
+    assert moved(end.minimum, found.minimum) < 1.0
+
+
+def test_where_the_trust_region_cuts_a_step_short_no_hyper_parameter_moves(twins, twin):
+    """What is still motion would pass for noise."""
+    problem, settings = twins.exact_problem(twin), twins.settings(0.1)
+    unknowns = np.concatenate([settings.starts[0], np.zeros(len(twin.coefficients))])
+    basis = twins.objective_of(problem, twin.coefficients)
+    filled = fit_coefficients(with_first_noise(basis), unknowns, bounds=settings.bounds)
+    start = begun(with_first_noise(basis), filled.unknowns)
+    one = minimised(start, settings.bounds, replace(CHEAP, iterations=1), progress=twins.silent, title="")
+    assert np.abs(one.minimum.unknowns - filled.unknowns)[:2].max() == pytest.approx(0.5 * RADIUS)
+    assert one.objective.states[0].noise == start.objective.states[0].noise
+    assert Criterion.STEP in one.convergence.unmet
+    assert one.minimum.outcome is Outcome.STEPS
+    end = minimised(start, settings.bounds, StopRule(), progress=twins.silent, title="")
+    assert end.minimum.unknowns[:2] == pytest.approx(twins.TRUTH, abs=1e-4)
+
+
+def test_bounds_hold_and_what_they_hold_back_is_a_minimum(twins, voxels):
+    narrow = twins.settings(1.0, limits=(0.5, 2.0))
+    found = invert(voxels, narrow, progress=twins.silent)
+    assert found.minimum.converged
+    assert narrow.bounds.reached(found.minimum.unknowns[:2]).any()
+
+
+def test_log_moduli_that_are_held_stay(twins, twin, voxels):
+    objective = twins.objective_of(voxels, twin.coefficients)
+    unknowns = np.append([0.3, 0.1], np.zeros(len(twin.coefficients)))
+    fitted = fit_coefficients(objective, unknowns, bounds=twins.settings(1.0).bounds)
+    assert fitted.converged
+    assert np.array_equal(fitted.unknowns[:2], unknowns[:2])
+    assert objective.rematched(fitted.unknowns)(fitted.unknowns).value < 0.2 * objective(unknowns).value
+
+
+def test_a_step_that_raises_the_objective_is_refused_and_a_shorter_one_taken(twins, twin, voxels, monkeypatch):
+    """The first trial is said to lead uphill; where every one does, it is no minimum."""
+    objective, bounds = twins.objective_of(voxels, twin.coefficients), twins.settings(1.0).bounds
+    start = begun(objective, np.append([0.0, 0.0], twin.coefficients))
+    evaluated, refused = trust_region._evaluated, []
+
+    def uphill(times):
+        def told(*of):
+            there, judged, spent = evaluated(*of)
+            if len(refused) < times:
+                refused.append(there.minimum.unknowns)
+                way = there.minimum.unknowns - start.minimum.unknowns
+                return there, replace(judged, value=judged.value + 1e6, score=judged.score + 1e12 * way), spent
+            return there, judged, spent
+
+        return told
+
+    one = replace(CHEAP, iterations=1, learn=False)
+    whole = minimised(start, bounds, one, progress=twins.silent, title="").minimum.unknowns
+    monkeypatch.setattr(trust_region, "_evaluated", uphill(1))
+    part = minimised(start, bounds, one, progress=twins.silent, title="").minimum.unknowns
+    lengths = [np.abs(x - start.minimum.unknowns)[:2].max() for x in (whole, part)]
+    assert 0.0 < lengths[1] < 0.6 * lengths[0]
+    refused.clear()
+    monkeypatch.setattr(trust_region, "_evaluated", uphill(99))
+    stuck = minimised(start, bounds, one, progress=twins.silent, title="")
+    assert stuck.minimum.outcome is Outcome.STUCK
+    assert np.array_equal(stuck.minimum.unknowns, start.minimum.unknowns)
+    assert len(refused) == TRIALS
+
+
+def test_a_trial_without_equilibrium_is_refused_and_its_reason_told_where_there_is_no_other(
+    twins, twin, voxels, monkeypatch
+):
+    start = begun(twins.objective_of(voxels, twin.coefficients), np.append([0.0, 0.0], twin.coefficients))
+    evaluated, failures = trust_region._evaluated, []
+
+    def folded(*of):
+        if len(failures) < 2:
+            failures.append(1)
+            raise NotConverged("folded")
+        return evaluated(*of)
+
+    bounds, one = twins.settings(1.0).bounds, replace(CHEAP, iterations=1)
+    monkeypatch.setattr(trust_region, "_evaluated", folded)
+    end = minimised(start, bounds, one, progress=twins.silent, title="")
+    assert end.totals
+    failures.clear()
+    monkeypatch.setattr(trust_region, "TRIALS", 2)
+    with pytest.raises(NotConverged, match="folded"):
+        minimised(start, bounds, one, progress=twins.silent, title="")
+
+
+def test_the_history_is_that_of_the_loop_alone_and_begins_where_the_first_start_ended(found):
+    (start,) = found.starts
+    history = found.minimum.history
+    assert len(history) > 1
+    assert not set(map(id, history)) & set(map(id, start.minimum.history))
+
+
+@pytest.mark.parametrize("name", ["step", "linearisation", "model_error"])
+def test_what_is_not_met_is_not_called_converged(name):
+    met = Convergence(0.9, 0.9, 0.9)
+    assert met.converged
+    assert met.unmet == ()
+    (criterion,) = replace(met, **{name: 1.0}).unmet
+    assert criterion is Criterion[name.upper()]
+    assert Convergence().unmet == tuple(Criterion)
+
+
+def test_too_few_iterations_are_not_called_convergence(twins, voxels):
+    rule = StopRule(iterations=1)
+    found = invert(voxels, twins.settings(0.5), progress=twins.silent, rule=rule)
+    assert found.minimum.outcome is Outcome.STEPS
+    assert not found.convergence.converged
+
+
+def test_a_model_that_cannot_be_made_exact_enough_is_not_called_convergence(twins, found):
+    end = on(found, found.objective, twins, StopRule(model_error=1e-14, derivatives=False, iterations=3))
+    assert end.convergence.unmet == (Criterion.MODEL_ERROR,)
+    assert end.minimum.outcome is Outcome.STEPS
+
+
+def test_an_estimate_may_move_by_a_share_of_its_own_uncertainty_but_not_without_end(found):
+    sd = posterior_sd(found.minimum, 2)
+    assert StopRule(step_sd=0.1, floor=0.0).tolerance(found.minimum, 2) == pytest.approx(0.1 * sd)
+    assert StopRule(step_sd=0.0, floor=0.01).tolerance(found.minimum, 2).tolist() == [0.01, 0.01]
+
+
+def test_what_an_approximation_misses_is_told_by_how_far_it_sets_the_moduli_off(twins, twin, voxels):
+    """H^-1 J^T W (r - r_approximate) with the full model's residuals r, from one right-hand side, to a tenth."""
+    crude = reduced_basis(twin.model, np.exp([0.3, -0.2, 0.0]) * twin.moduli)
+    start = begun(twins.objective_of(voxels, twin.coefficients).under([crude]), twin.unknowns)
+    objective, here = start.objective, start.minimum
+    error, off, _ = trust_region.model_error(objective, here)
+    place = LinearisationPoint(objective.parameters.moduli(here.unknowns), here.unknowns[2:])
+    full = objective.under([exact_approximation(twin.model, None, place)])(here.unknowns)
+    pull = np.zeros(len(here.unknowns))
+    for line, exact in zip(here.evaluation.linearisations, full.linearisations, strict=True):
+        change = exact.residuals.values - line.residuals.values
+        pull[line.columns] += line.jacobian.transposed_times(line.precision * line.weights * change)
+    true = np.abs(here.evaluation.covariance_columns(2).T @ pull)
+    assert error > 1e-3
+    assert true.max() > 1e-3
+    assert off == pytest.approx(true, abs=0.1 * true.max())
+
+
+def test_an_approximation_that_cannot_say_what_it_misses_leaves_everything_open(twins, twin, voxels, monkeypatch):
+    basis = reduced_basis(twin.model, twin.moduli)
+    start = begun(twins.objective_of(voxels, twin.coefficients).under([basis]), twin.unknowns)
+    silent = ModelError(np.inf, np.zeros(0))
+    monkeypatch.setattr(type(basis), "error", lambda _self, _at: silent)
+    error, off, _ = trust_region.model_error(start.objective, start.minimum)
+    assert error == np.inf
+    assert off.tolist() == [np.inf, np.inf]
+
+
+def test_derivatives_that_are_exact_nowhere_leave_everything_open(found):
+    state, minimum = found.objective.states[0], found.minimum
+    basis, sd = state.approximation, posterior_sd(minimum, 2)
+    here = LinearisationPoint(
+        found.objective.parameters.moduli(minimum.unknowns), minimum.unknowns[2:], np.eye(3, 1), np.eye(3)
+    )
+
+    def left(place):
+        return trust_region._linearisation(found.objective.under([replace(basis, place=place)]), minimum)
+
+    assert np.all(left(None) == np.inf)
+    assert np.all(left(replace(here, directions=None)) == np.inf)
+    assert left(here) == pytest.approx(0.0, abs=1e-12)
+    apart = replace(here, moduli=here.moduli * np.exp([0.1, 0.0, 0.0]))
+    assert left(apart) == pytest.approx(0.1 * np.maximum(sd, 0.03))
+
+
+def test_another_start_leaves_the_first_objective_as_it_was(twins, twin, voxels):
+    objective = twins.objective_of(voxels, twin.coefficients)
+    before = objective.rematched(twin.unknowns).value(twin.unknowns)
+    minimised(begun(objective, twin.unknowns), twins.settings(1.0).bounds, CHEAP, progress=twins.silent, title="")
+    assert isinstance(objective, Objective)
+    assert objective.rematched(twin.unknowns).value(twin.unknowns) == before
