@@ -271,8 +271,10 @@ def _linear(
             followed.append(ends[number])
             continue
         start = replace(ends[number], minimum=replace(ends[number].minimum, evaluations=0))
-        followed.append(minimised(start, bounds, rule, progress=progress, title="linear law"))
-        spent += followed[-1].minimum.evaluations
+        end = minimised(start, bounds, rule, progress=progress, title="linear law")
+        spent += end.minimum.evaluations
+        history = ends[number].minimum.history + end.minimum.history[1:]
+        followed.append(replace(end, minimum=replace(end.minimum, history=history)))
     place = {number: order.index(best[same[number]]) for number in range(len(ends))}
     starts = tuple(
         StartRun(theta, minimum, place[belongs[group]] if group in belongs else None)

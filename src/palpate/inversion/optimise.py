@@ -87,11 +87,6 @@ class Minimum:
         """Whether it is a minimum."""
         return self.outcome.converged
 
-    def after(self, before: Minimum) -> Minimum:
-        """The same with the way, and the cost, of what led to where it began."""
-        history, evaluations = before.history + self.history, before.evaluations + self.evaluations
-        return replace(self, history=history, evaluations=evaluations)
-
 
 @dataclass(frozen=True, slots=True)
 class TrustRegion:

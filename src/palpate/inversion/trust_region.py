@@ -267,7 +267,7 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
             break
         moved = np.abs(again.unknowns - found.unknowns)[:n] / rule.tolerance(again, n)
         change, objective, found, total = total - lower, learned, again, lower
-        if np.all(moved < 0.1) and change < 0.01:
+        if np.all(moved < 0.1) and change < INNER:
             break
     begin = LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns)
     return _Step(objective, found, begin, now, total, cut)
@@ -282,8 +282,7 @@ def _cut_short(theta: NDArray[np.float64], near: Bounds, bounds: Bounds) -> bool
 def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIterate, Evaluation, int]:
     """The objective at the end of a step, its model made exact there where its error matters.
 
-    With it the evaluation by which the step is judged: on the model that the step began with, but where that was exact,
-    on one that is exact at both ends; and the evaluations spent.
+    With it the evaluation by which the step is judged, on the model that it was made on, and the evaluations spent.
     """
     n, unknowns = step.objective.n_parameters, step.minimum.unknowns
     objective = step.objective.rematched(unknowns)

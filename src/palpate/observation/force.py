@@ -16,7 +16,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.contract import DataFile, Fit, Reaction, ReactionOf, Residuals, Weighting
 from palpate.observation.noise_model import FitResponse, NoiseModel
-from palpate.observation.robust_loss import PowerLaw
+from palpate.observation.robust_loss import FAR, PowerLaw
 
 ALONE = 1e-3  # mm: no other residual is alike
 
@@ -110,8 +110,8 @@ class Force:
         return self.stated.sd, self.stated.sd
 
     def with_sd(self, sd: float) -> Force:
-        """The same, counting by another standard deviation."""
-        return replace(self, weighting=Weighting(1.0 / sd**2, PowerLaw()))
+        """The same; a force that all else contradicts counts less, the further off it is."""
+        return replace(self, weighting=Weighting(1.0 / sd**2, PowerLaw(FAR * sd)))
 
     def with_correlation(self, noise: NoiseModel) -> Force:
         """The same noise: it is one residual."""

@@ -13,9 +13,8 @@ from palpate.mesh.locate import Places, point_interpolation
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.contract import DataFile, Fit, PointMotions, Residuals, Weighting
 from palpate.observation.noise_model import FitResponse, NoiseModel, whitener
-from palpate.observation.robust_loss import PowerLaw
+from palpate.observation.robust_loss import FAR, PowerLaw
 
-FAR = 3.0  # cutoff in standard deviations, 99 % efficient for normal errors
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
 ALONE = 1e-3  # mm: length over which errors that are independent are alike
 FEW = 30  # residuals, of which a spread is not told

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+HUBER, FAR = 1.345, 3.0  # cutoffs in standard deviations: 95 and 99 % efficient for normal errors (Huber 1981)
+
 
 class RobustLoss(Protocol):
     """A loss rho(r) with the slope 2 r w(r): p(r) = exp(-rho(r) / (2 s^2)) / Z(s) is a density of scale s."""

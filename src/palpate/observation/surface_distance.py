@@ -23,12 +23,11 @@ from palpate.observation.noise_model import (
     fit_noise_model,
 )
 from palpate.observation.observed_surface import ObservedSurface, field_of_view, observed_surfaces, seen_in
-from palpate.observation.robust_loss import Huber, PowerLaw, RobustLoss
+from palpate.observation.robust_loss import FAR, HUBER, Huber, PowerLaw, RobustLoss
 from palpate.observation.surface_residuals import Correspondence, correspondence, surface_residuals
 from palpate.observation.target import SurfaceTarget, surface_target
 from palpate.parallel import mapped
 
-HUBER, FAR = 1.345, 3.0  # cutoffs in standard deviations: 95 and 99 % efficient for normal errors (Huber 1981)
 FLOOR = 1e-3  # mm: no surface in an image is known better
 LEAST_POINTS = 30  # of a surface that is neither an organ's nor a driver's, to be compared
 RIGID = 6.0  # freedoms of a rigid motion

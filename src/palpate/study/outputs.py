@@ -384,7 +384,7 @@ def _refuse_improper(folder: Path, names: Iterable[str]) -> None:
 
 def no_constant(name: str) -> float:
     """Raise `ValueError` for what JSON does not know and Python's reader takes all the same: NaN, Infinity."""
-    raise ValueError(f"it holds {name}")
+    raise ValueError(f"{name} is no number")
 
 
 def _refused(path: Path, error: OSError) -> ResourceError:
