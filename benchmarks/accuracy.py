@@ -108,7 +108,7 @@ def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> Result:
         linear = invert(problem.linear(), settings, progress=_silent)
         result["linear_ln_error"] = _errors(linear, scene)["ln_error"]
         if seed % 5 == 1 and draw == 0 and row.noise is None:
-            result["far_off_ln_error"] = _errors(_from_far_off(problem, linear, settings), scene)["ln_error"]
+            result["far_off_ln_error"] = _errors(_from_far_off(inversion, linear, settings), scene)["ln_error"]
     if case.bodies:
         result |= _uncertainty(inversion, problem, case.bodies[0], scene, settings, row)
         result |= _driver_error(inversion, space, scene)
@@ -119,12 +119,12 @@ def _silent(message: str) -> None:
     del message
 
 
-def _from_far_off(problem: InverseProblem, linear: Inversion, settings: InversionSettings) -> Inversion:
-    """The continuation from moduli that are three times too high and too low instead of the linear estimate's."""
+def _from_far_off(finite: Inversion, linear: Inversion, settings: InversionSettings) -> Inversion:
+    """The continuation of a `finite` estimate from moduli three times too high and too low, not the linear one's."""
     n, best = linear.objective.n_parameters, linear.candidates[linear.best]
     unknowns = linear.minimum.unknowns.copy()
     unknowns[:n] += FAR_OFF[:n]
-    pairs = zip(linear.objective.states, problem.states, strict=True)
+    pairs = zip(linear.objective.states, finite.objective.states, strict=True)
     states = tuple(replace(state, finite_strain=given.finite_strain) for state, given in pairs)
     iterate = replace(
         best.iterate,

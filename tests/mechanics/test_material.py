@@ -154,6 +154,22 @@ def test_a_reduced_basis_tells_what_its_responses_to_the_material_miss_elsewhere
     assert np.linalg.norm(basis.error(there).missing - missing) < 0.3 * np.linalg.norm(missing)
 
 
+def test_an_updated_reduced_basis_misses_nothing_of_what_follows_the_material(body, modes, coefficients, rng):
+    """Where it was updated: the material's coefficients there are no combination of the directions that decide."""
+    model, every = linear_model(*body, material=modes), np.concatenate(coefficients)
+    first = reduced_basis(model, MODULI)
+    first = first.with_material(first.system.material_responses(model.solve(MODULI, every).values))
+    n = model.n_regions + len(every)
+    directions = rng.normal(size=(n, 2))
+    at = LinearisationPoint(MODULI * [1.2, 1.0], every, directions, np.eye(n))
+    basis = first.update(at)
+    missing = model.solve(at.moduli, every).values - basis.model.solve(at.moduli, every).values
+    before = model.solve(at.moduli, every).values - first.model.solve(at.moduli, every).values
+    assert first.error(at).relative > 1e-3
+    assert basis.error(at).relative < 0.05 * first.error(at).relative
+    assert np.linalg.norm(missing) < 0.05 * np.linalg.norm(before)
+
+
 @pytest.mark.parametrize("dilatation", list(Dilatation))
 def test_the_linear_law_is_the_small_strain_limit_of_a_patchy_body(body, modes, coefficients, dilatation):
     """To first order in the material: a hundredth of the motion and of the modes, derivatives and all."""

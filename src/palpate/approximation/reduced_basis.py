@@ -94,26 +94,25 @@ class ReducedBasis:
 
         new, directions = int(not at.same_as(self.place)), at.directions  # whether the displacement is sought, too
         if directions is not None:
-            if stale:
-                sharper = _with_material_anew(sharper, displacement)
-            else:
-                sharper = _with_sharper_material(sharper, at, displacement, solved)
             directions = directions[: model.n_regions + model.constraint.n_modes]
         loads = -model.residual(at.moduli, displacement[:, None])[:, :new]
         if directions is not None:
             derivatives = model.boundary_loads(at.moduli, displacement, directions)
             amplitudes = self.model.system(at.moduli).backward(self.projection.components(derivatives))
             loads = np.concatenate([loads, derivatives - matrix @ self.projection.spanned(amplitudes)], axis=1)
-        if not loads.shape[1]:
-            return sharper
-        missing = solved(loads, np.array([DISPLACEMENT] * new + [TANGENT] * (loads.shape[1] - new)))
-        cost = SolveCounts(forward=new, tangent=loads.shape[1] - new)
-        late = np.asarray(model.constraint.free @ missing[:, :new])
-        if directions is not None and np.linalg.norm(late) > FAR_OFF * np.linalg.norm(displacement):
-            by_modulus = np.where(np.arange(len(directions))[:, None] < model.n_regions, directions, 0.0)
-            missing[:, new:] += solved(model.boundary_loads(at.moduli, late[:, 0], by_modulus), TANGENT)
-            cost += SolveCounts(tangent=directions.shape[1])
-        return replace(_extended(sharper, missing, cost), place=at)
+        if loads.shape[1]:
+            missing = solved(loads, np.array([DISPLACEMENT] * new + [TANGENT] * (loads.shape[1] - new)))
+            cost = SolveCounts(forward=new, tangent=loads.shape[1] - new)
+            late = np.asarray(model.constraint.free @ missing[:, :new])
+            if directions is not None and np.linalg.norm(late) > FAR_OFF * np.linalg.norm(displacement):
+                by_modulus = np.where(np.arange(len(directions))[:, None] < model.n_regions, directions, 0.0)
+                missing[:, new:] += solved(model.boundary_loads(at.moduli, late[:, 0], by_modulus), TANGENT)
+                cost += SolveCounts(tangent=directions.shape[1])
+            displacement = displacement + late.sum(axis=1)
+            sharper = replace(_extended(sharper, missing, cost), place=at)
+        if stale:
+            return _with_material_anew(sharper, displacement)
+        return _with_sharper_material(sharper, at, displacement, solved)
 
     @property
     def error_counts(self) -> SolveCounts:
@@ -213,12 +212,14 @@ def _with_sharper_material(
 ) -> ReducedBasis:
     """The responses U to the material modes made exact at a place along its directions D of these coefficients.
 
-    They become U + (C - U D) (D^T H D)^+ D^T H with the exact C and the metric H, as those of an `Expansion`.
+    They become U + (C - U D) (D^T H D)^+ D^T H with the exact C and the metric H, as those of an `Expansion`. The
+    coefficients at the place are one of the directions: of their part of the displacement nothing is missed then.
     """
     model, first = basis.full_model, basis.full_model.n_regions + basis.constraint.n_modes
     if not model.material.n_modes or at.directions is None or at.metric is None:
         return basis
     along, metric = at.directions[first:], at.metric[first:, first:]
+    along = np.column_stack([along, at.coefficients[basis.constraint.n_modes :]])
     along = along[:, np.linalg.norm(along, axis=0) > 0.0]
     free, before = model.constraint.free, basis.model.output_material
     loads = -np.asarray(free.T @ model.material_forces(at.moduli, displacement, along))
