@@ -27,7 +27,7 @@ from palpate.errors import PalpateError
 from palpate.inversion import invert, posterior_sd
 
 MOST = 0.1  # posterior standard deviations
-SHARES = ("BAD", "GOOD", "FITTED", "SLOW")
+SHARES = ("BAD", "GOOD", "FITTED")
 
 
 def main() -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import Protocol, Self
 
 import numpy as np
@@ -42,28 +41,18 @@ class LocalModel(ForwardModel, Protocol):
         ...
 
 
-class Derivatives(Enum):
-    """Which derivatives are made exact at a place, where that has a price."""
-
-    KEPT = "none, those of elsewhere serve"
-    DECIDING = "those along the directions that decide the moduli"
-    ALL = "those by all moduli and modes"
-
-
 @dataclass(frozen=True, slots=True)
 class LinearisationPoint:
     """Moduli (n_regions,) kPa and driver coefficients (n_modes,) at which a model is approximated.
 
-    directions (n_regions + n_modes, k) of (ln E, q): those along which derivatives are wanted, None where the
-    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there;
-    derivatives: which are made exact there.
+    directions (n_regions + n_modes, k) of (ln E, q): those along which derivatives are made exact, None where the
+    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there.
     """
 
     moduli: NDArray[np.float64]
     coefficients: NDArray[np.float64]
     directions: NDArray[np.float64] | None = None
     metric: NDArray[np.float64] | None = None
-    derivatives: Derivatives = Derivatives.DECIDING
 
     def same_as(self, other: LinearisationPoint | None) -> bool:
         """Whether moduli and coefficients are those of another place."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.approximation.contract import Approximation, Derivatives, LinearisationPoint, ModelError, determined
+from palpate.approximation.contract import Approximation, LinearisationPoint, ModelError, determined
 from palpate.errors import NotConverged, SolverError
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel
@@ -63,18 +63,17 @@ class Expansion:
         return LinearisationPoint(self.equilibrium.moduli, self.equilibrium.coefficients)
 
     def update(self, at: LinearisationPoint) -> Expansion:
-        """The expansion around the equilibrium at another place, derivatives exact there as asked.
+        """The expansion around the equilibrium at another place, derivatives exact there along its directions.
 
-        All of them where they are few. With directions D, the exact C along them and H the metric T becomes
+        Along all where they are few. With directions D, the exact C along them and H the metric T becomes
         T + (C - T D) (D^T H D)^+ D^T H: of all T' with T' D = C the one that changes least. The other columns stay as
         they were where T was made. Raises `NotConverged` when there is no equilibrium.
         """
         there = self if at.same_as(self.place) else self._around(self._equilibrium(at))
         few = there.model.n_regions + there.model.n_modes <= FEW
-        wanted = Derivatives.ALL if few else at.derivatives
-        if at.directions is None or at.metric is None or wanted is Derivatives.KEPT:
+        if at.directions is None or at.metric is None:
             return there
-        directions = np.eye(len(at.directions)) if wanted is Derivatives.ALL else at.directions
+        directions = np.eye(len(at.directions)) if few else at.directions
         before = there.model.derivatives @ directions
         change = there.equilibrium.tangent_along(directions, before) - before
         with determined():

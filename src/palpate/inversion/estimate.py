@@ -35,7 +35,6 @@ REPORTED = StopRule()
 CHEAP = StopRule(step_sd=0.3, floor=0.01)
 ELSEWHERE = replace(CHEAP, correlate=False)  # the numbers of independent residuals stay: objectives are compared
 FOLLOWED = 2  # minima of starts beside the first one, the best
-FIRST_GUESS = StopRule(step_sd=0.5, model_error=np.inf, derivatives=False)
 RELEASED = StopRule(step_sd=0.2)  # an interval, to a tenth of its half-width
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
 
@@ -136,11 +135,11 @@ def invert(
         )
     middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
     begin = np.concatenate([middle, np.zeros(problem.parameters.n_coefficients)])
-    first = FIRST_GUESS if problem.finite_strain else rule
+    last = None if problem.finite_strain else rule
     if any(state.approximation is None for state in problem.states):
-        linear = [_linear(*_with_reduced_bases(problem, settings, begin, progress), settings, first, progress)]
+        linear = [_linear(*_with_reduced_bases(problem, settings, begin, progress), settings, last, progress)]
     else:
-        linear = [_linear(Objective(problem.states, problem.parameters), begin, 0, settings, first, progress)]
+        linear = [_linear(Objective(problem.states, problem.parameters), begin, 0, settings, last, progress)]
     if not problem.finite_strain:
         return linear[0]
     there = during("finite strain", progress)
@@ -238,13 +237,13 @@ def _linear(
     begin: NDArray[np.float64],
     evaluations: int,
     settings: InversionSettings,
-    rule: StopRule,
+    rule: StopRule | None,
     progress: Progress,
 ) -> Inversion:
     """The estimate of the linear law: every start on the cheap model, the best ones followed to their ends.
 
-    begin (n_unknowns,): the middle start, with the blocks' coefficients near the best ones there, and what it cost to
-    find them in evaluations.
+    rule: of these; None: they end near, as the start of another law. begin (n_unknowns,): the middle start, with the
+    blocks' coefficients near the best ones there, and what it cost to find them in evaluations.
     """
     still, n, bounds = np.zeros(objective.parameters.n_unknowns), objective.n_parameters, settings.bounds
     objective = with_first_noise(objective).rematched(still)
@@ -267,7 +266,7 @@ def _linear(
     order = sorted(best, key=lambda i: totals[i])
     followed = list[OuterIterate]()
     for number in order:
-        if followed and not as_good(totals[number], totals[order[0]]):
+        if rule is None or (followed and not as_good(totals[number], totals[order[0]])):
             followed.append(ends[number])
             continue
         start = replace(ends[number], minimum=replace(ends[number].minimum, evaluations=0))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from palpate.approximation.contract import Approximation, Derivatives, LinearisationPoint, determined
+from palpate.approximation.contract import Approximation, LinearisationPoint, determined
 from palpate.inversion.later_state import LaterState
 from palpate.mechanics.forward import Equilibrium
 from palpate.observation.contract import Observation, OfMaterial, Rematched, Residuals
@@ -141,10 +141,7 @@ class Objective:
         return found
 
     def linearisation_points(
-        self,
-        unknowns: NDArray[np.float64],
-        evaluation: Evaluation | None = None,
-        derivatives: Derivatives = Derivatives.KEPT,
+        self, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None
     ) -> list[LinearisationPoint]:
         """What unknowns (n_unknowns,) mean for each state; by an `evaluation` with the directions that decide there."""
         mapping = self.parameters
@@ -155,7 +152,7 @@ class Objective:
         for s, q in enumerate(coefficients):
             own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
             metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
-            places.append(LinearisationPoint(moduli, q, chain @ directions[own], metric, derivatives))
+            places.append(LinearisationPoint(moduli, q, chain @ directions[own], metric))
         return places
 
     def under(self, approximations: Sequence[Approximation]) -> Objective:

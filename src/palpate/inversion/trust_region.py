@@ -12,7 +12,6 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.approximation.contract import Derivatives
 from palpate.errors import NotConverged
 from palpate.inversion.hyper_parameters import with_correlations, with_hyper_parameters
 from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
@@ -35,7 +34,6 @@ from palpate.progress import silent
 NOISE = 0.5  # of the objective: that of closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
 INNER = 1e-4  # decrement of a minimum on linear residuals
 SETTLES = 6  # iterations, after which numbers of independent residuals stay, and the trust region no longer grows
-SLOW = 0.5  # of the model's error an iteration before: where more is left all derivatives are made exact
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
 
 
@@ -306,9 +304,7 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
     checks, matters = now.checks + cost, max(missing, left) >= 1.0
     judged = minimum.evaluation
     if matters:
-        slow = missing >= 1.0 and missing > SLOW * now.convergence.model_error
-        derivatives = Derivatives.ALL if slow else Derivatives.DECIDING
-        places = objective.linearisation_points(unknowns, minimum.evaluation, derivatives)
+        places = objective.linearisation_points(unknowns, minimum.evaluation)
         pairs = zip(objective.approximations, places, strict=True)
         objective = objective.under([approximation.update(place) for approximation, place in pairs])
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
