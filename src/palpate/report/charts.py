@@ -89,7 +89,7 @@ def forces_svg(data: ReportData, *, name: str) -> str:
 
 
 def objective_svg(data: ReportData, *, name: str) -> str:
-    """Misfit (mm^2) of every start against the iteration, then of the outer loop that they share, as SVG."""
+    """Misfit (mm^2) of every start, and of the outer loop from their middle, against the iteration, as SVG."""
     histories = [start["history_mm2"] for start in data.document["starts"]]
     histories.append(data.document["outer_loop"]["history_mm2"])
     paths = [list(np.array(history, dtype=np.float64)) for history in histories]  # NaN for nothing
@@ -305,16 +305,22 @@ def _told(paths: list[list[float]], unit: str) -> str:
 
 
 def _paths(figure: Figure, paths: list[list[float]], label: str) -> None:
-    """One line a start on a logarithmic axis; the last path, the outer loop's, goes on where the starts end."""
+    """One line a start on a logarithmic axis, and a thicker one for the last path, the outer loop's."""
     axes = figure.add_axes((0.23, 0.2, 0.74, 0.74))
     for start, path in enumerate(paths[:-1]):
         colour = START_COLOURS[start % len(START_COLOURS)]
         axes.plot(range(len(path)), path, color=colour, linewidth=1.6, marker="o", markersize=3.2)
-    first = max((len(path) for path in paths[:-1]), default=0)
     for path in (path for path in paths[-1:] if path):
-        axes.plot(range(first, first + len(path)), path, color=INK, linewidth=1.6, marker="o", markersize=3.2)
-        axes.axvline(first - 0.5, color=INK, linewidth=0.8, linestyle=DASHED)
-        axes.text(first - 0.5, 1.0, " outer loop", transform=axes.get_xaxis_transform(), fontsize=7.5, va="bottom")
+        axes.plot(range(len(path)), path, color=INK, linewidth=2.4, marker="o", markersize=4.0)
+        axes.annotate(
+            "outer loop",
+            (len(path) - 1, path[-1]),
+            xytext=(3.0, 3.0),
+            textcoords="offset points",
+            ha="right",
+            va="bottom",
+            fontsize=7.5,
+        )
     axes.set_xlabel("iteration")
     axes.set_ylabel(label)
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
