@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import qmc
 
 from palpate.errors import ConfigurationError, EstimationError, ResourceError
 from palpate.findings import Finding, of_pair
@@ -37,7 +36,7 @@ from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
 from palpate.unknowns import ParameterMap, eta_of_ratio
 
-FURTHER = 13  # starts beside those of the case
+FURTHER = 13  # starts beside those of the case; a prime
 
 
 def estimate(
@@ -185,7 +184,8 @@ def _forecast(cost: ExpectedCost) -> Forecast:
 def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSettings:
     """Starts and bounds as theta; those in kPa are divided by the scale's modulus, Poisson's ratios begin as given.
 
-    The case's starts, on the diagonal of all moduli, then some of a Sobol sequence over the bounds.
+    The case's starts, on the diagonal of all moduli, then a lattice over the bounds: with N further ones the shares
+    ((k 2^j mod N) + 1/2) / N of modulus j (Korobov 1959), which fill the box evenly.
     """
     scale = parameters.scale_kpa
     options = case.estimate
@@ -198,7 +198,8 @@ def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSetting
     ]
     begin = tuple(np.concatenate([np.full(n, np.log(start)), given]) for start in starts)
     low, high = (end[:n] for end in ends)
-    shares = qmc.Sobol(n, scramble=False).random_base2(4)[1 : 1 + FURTHER]  # the first is a corner
+    steps = np.array([pow(2, j, FURTHER) for j in range(n)])
+    shares = (np.arange(FURTHER)[:, None] * steps % FURTHER + 0.5) / FURTHER
     further = tuple(np.concatenate([low + share * (high - low), given]) for share in shares)
     return InversionSettings(begin, Bounds(*ends), further)
 
