@@ -124,7 +124,8 @@ def begun(objective: Objective, unknowns: NDArray[np.float64]) -> OuterIterate:
 class _Step:
     """A minimum on linear residuals: unknowns, the hyper-parameters there, J at both ends; cut: by the trust region.
 
-    begin: the evaluation where it begins, under these hyper-parameters.
+    begin: the evaluation where it begins, under these hyper-parameters; settled: whether what is left of the residuals
+    there is no motion, so that it tells how many of them are independent.
     """
 
     objective: Objective
@@ -133,6 +134,7 @@ class _Step:
     now: float
     then: float
     cut: bool
+    settled: bool
 
     def reductions(self, unknowns: NDArray[np.float64], judged: Evaluation) -> tuple[float, float]:
         """By how much J falls on a way from unknowns (n,) to where it is `judged`, and on linear residuals.
@@ -234,8 +236,8 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
 
     In turn, each of which lowers it: unknowns under given hyper-parameters, and these (see `with_hyper_parameters`).
     Where the step is damped hyper-parameters stay. So do the numbers of independent residuals where the trust region,
-    and no bound, ends the step, for what is still motion is alike over whole surfaces; and once they have been taken
-    anew some times.
+    and no bound, ends the step, or it is longer than a standard deviation of some log-modulus, for what is still motion
+    is alike over whole surfaces; and once they have been taken anew some times.
     """
     objective, at, n = start.objective, start.minimum, start.objective.n_parameters
     trusted = [state.approximation.trust_radius for state in objective.states if state.approximation]
@@ -249,9 +251,10 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     cut = damping > 0.0 or (not fixed and _cut_short(found.unknowns[:n], near, bounds))
     if damping or not rule.learn:
         ends = objective.total(at.evaluation), objective.total(found.evaluation)
-        return _Step(objective, found, at.evaluation, *ends, cut)
+        return _Step(objective, found, at.evaluation, *ends, cut, settled=False)
     now, total = objective.total(at.evaluation), objective.total(found.evaluation)
-    if rule.correlate and not cut and start.correlated < SETTLES:
+    settled = not cut and bool(np.all(np.abs(found.unknowns - at.unknowns)[:n] < posterior_sd(found, n)))
+    if rule.correlate and settled and start.correlated < SETTLES:
         objective = with_correlations(objective, found.evaluation)
         plain = LinearisedObjective(objective, at.unknowns, at.evaluation)
         found = replace(found, evaluation=plain(found.unknowns))
@@ -268,7 +271,7 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
         if np.all(moved < 0.1) and change < INNER:
             break
     begin = LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns)
-    return _Step(objective, found, begin, now, total, cut)
+    return _Step(objective, found, begin, now, total, cut, settled)
 
 
 def _cut_short(theta: NDArray[np.float64], near: Bounds, bounds: Bounds) -> bool:
@@ -294,7 +297,7 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
     if np.isfinite(rule.coefficients):
         decrement = newton_decrement_of(now.minimum, unknowns)
         wanted = max(0.0 if np.isinf(rule.step_sd) else size, decrement / (rule.coefficients * len(unknowns)))
-    correlated = now.correlated + (rule.learn and not step.cut)
+    correlated = now.correlated + step.settled
     if np.isinf(rule.model_error):
         there = OuterIterate(objective, minimum, Convergence(wanted, 0.0, 0.0), now.checks, now.totals)
         return replace(there, correlated=correlated), minimum.evaluation, spent
