@@ -108,6 +108,29 @@ def test_where_the_trust_region_cuts_a_step_short_no_hyper_parameter_moves(twins
     assert end.minimum.unknowns[:2] == pytest.approx(twins.TRUTH, abs=1e-4)
 
 
+@pytest.mark.parametrize("ratio", [0.5, 12.0])
+def test_a_step_longer_than_a_standard_deviation_tells_no_number_of_independent_residuals(twins, twin, voxels, ratio):
+    """What it leaves is motion, alike over whole surfaces: it would pass for one residual a surface."""
+    objective = with_first_noise(twins.objective_of(voxels, twin.coefficients))
+    begin = np.concatenate([np.log([ratio, ratio]), twin.coefficients])
+    bounds = twins.settings(0.5).bounds
+    first = [o.weighting.count for o in begun(objective, begin).objective.observations]
+    counts, long = [first], []
+    for iterations in range(1, 6):
+        rule = replace(CHEAP, iterations=iterations)
+        end = minimised(begun(objective, begin), bounds, rule, progress=twins.silent, title="")
+        way = [iterate.theta for iterate in end.minimum.history]
+        if len(way) <= iterations:
+            break
+        long.append(bool(np.any(np.abs(way[-1] - way[-2]) >= posterior_sd(end.minimum, 2))))
+        counts.append([o.weighting.count for o in end.objective.observations])
+    assert long[0]
+    assert not all(long)
+    for before, after, was_long in zip(counts, counts[1:], long, strict=False):
+        assert after == before or not was_long
+    assert counts[-1] != first
+
+
 def test_bounds_hold_and_what_they_hold_back_is_a_minimum(twins, voxels):
     narrow = twins.settings(1.0, limits=(0.5, 2.0))
     found = invert(voxels, narrow, progress=twins.silent)
