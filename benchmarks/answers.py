@@ -111,12 +111,12 @@ def plain_estimate(
     still = np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
     objective = with_first_noise(_exact(Objective(problem.states, problem.parameters), still)).rematched(still)
     filled = fit_coefficients(objective, still, bounds=bounds)
-    start = replace(begun(_exact(objective, filled.unknowns), filled.unknowns), exact=True)  # at rest no modulus shows
+    start = begun(_exact(objective, filled.unknowns), filled.unknowns)  # at rest no modulus shows
     found = minimised(start, bounds, RULE, progress=progress, title="linear law")
     if not problem.finite_strain:
         return found
     unknowns = found.minimum.unknowns
-    start = replace(begun(_exact(found.objective, unknowns, finite_strain=True), unknowns), exact=True)
+    start = begun(_exact(found.objective, unknowns, finite_strain=True), unknowns)
     return minimised(start, bounds, RULE, progress=progress, title="finite strain")
 
 
@@ -124,7 +124,7 @@ def _plainly_on(case: Posed, product: Inversion) -> OuterIterate:
     """Where the plain loop leads from the product's answer."""
     unknowns = product.minimum.unknowns
     objective = _exact(product.objective, unknowns, finite_strain=case.problem.finite_strain)
-    start = replace(begun(objective, unknowns), exact=True)
+    start = begun(objective, unknowns)
     bounds = case.settings.bounds
     return minimised(start, bounds, RULE, progress=lambda line: _say(f"  {line}"), title="plainly on")
 

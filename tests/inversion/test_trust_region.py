@@ -87,7 +87,7 @@ def test_going_on_from_the_estimate_changes_nothing(twins, found):
 def test_the_full_model_finds_the_same_where_the_reduced_one_stands(twins, twin, found):
     """All derivatives of the full model exact at every place."""
     place = LinearisationPoint(found.objective.parameters.moduli(found.minimum.unknowns), found.minimum.unknowns[2:])
-    end = on(found, found.objective.under([exact_approximation(twin.model, None, place)]), twins, exact=True)
+    end = on(found, found.objective.under([exact_approximation(twin.model, None, place)]), twins)
     assert end.minimum.converged
     assert moved(end.minimum, found.minimum) < 1.0
 

@@ -21,7 +21,7 @@ from palpate.mechanics.equilibrium import ACCURACY
 from palpate.observation.noise_model import SEGMENTATION_NOISE
 from palpate.progress import silent
 
-FITTED = StopRule(step_sd=np.inf, coefficients=1e-3, model_error=np.inf, derivatives=False, learn=False)
+ON_WALL = StopRule(step_sd=np.inf, coefficients=1e-3, model_error=np.inf, derivatives=False, learn=False)
 
 Motions = tuple[NDArray[np.float64], ...]
 
@@ -67,7 +67,7 @@ def _fitted(
     objective = held.under(models).with_observations([o.with_noise(SEGMENTATION_NOISE) for o in held.observations])
     first = fit_coefficients(objective, begin, bounds=bounds)
     objective = with_amplitudes(objective, first.evaluation, first.unknowns)
-    found = minimised(begun(objective, first.unknowns), bounds, FITTED, progress=silent, title="", fixed=True).minimum
+    found = minimised(begun(objective, first.unknowns), bounds, ON_WALL, progress=silent, title="", fixed=True).minimum
     if not found.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
     return held.parameters.coefficients(found.unknowns)

@@ -33,7 +33,7 @@ from palpate.progress import Progress, during, silent
 
 REPORTED = StopRule()
 CHEAP = StopRule(step_sd=0.3, floor=0.01)
-ELSEWHERE = replace(CHEAP, correlate=False)  # the numbers of independent residuals stay: objectives are compared
+COMPARED = replace(CHEAP, correlate=False)  # the numbers of independent residuals stay: objectives are compared
 FOLLOWED = 2  # minima of starts beside the first one, the best
 RELEASED = StopRule(step_sd=0.2)  # an interval, to a tenth of its half-width
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
@@ -257,7 +257,7 @@ def _linear(
     others = sorted((i for i in others if groups[i] not in belongs), key=lambda i: screened[i].evaluation.value)
     for number in [i for i in others if screened[i].converged][:FOLLOWED]:
         start = begun(first.objective, screened[number].unknowns)
-        end = minimised(start, bounds, ELSEWHERE, progress=progress, title=f"start {number + 1}")
+        end = minimised(start, bounds, COMPARED, progress=progress, title=f"start {number + 1}")
         belongs[groups[number]], spent = len(ends), spent + end.minimum.evaluations
         ends.append(end)
     same = _groups([end.minimum for end in ends], n)
@@ -337,7 +337,7 @@ def _expanded(
     first = [expansion_around(equilibrium, tolerance=EQUILIBRIUM, progress=progress) for equilibrium in coarse]
     objective = objective.under(first).rematched(minimum.unknowns)
     now = replace(minimum, evaluation=objective(minimum.unknowns), evaluations=1)
-    return OuterIterate(objective, now, exact=True)
+    return OuterIterate(objective, now)
 
 
 def _at_equilibrium(end: OuterIterate, before: tuple[Iterate, ...]) -> OuterIterate:
@@ -387,7 +387,7 @@ def _values(distinct: Sequence[OuterIterate], bounds: Bounds) -> tuple[list[floa
     for iterate in distinct:
         pairs = zip(iterate.objective.observations, reference.observations, strict=True)
         same = iterate.objective.with_observations([o.with_correlation(r.noise_model) for o, r in pairs])
-        end = minimised(begun(same, iterate.minimum.unknowns), bounds, ELSEWHERE, progress=silent, title="compared")
+        end = minimised(begun(same, iterate.minimum.unknowns), bounds, COMPARED, progress=silent, title="compared")
         values.append(end.objective.total(end.minimum.evaluation))
         evaluations += end.minimum.evaluations
     return values, evaluations

@@ -26,7 +26,7 @@ from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns.blocks import Acts, Block
 
-FIRST, ELSEWHERE = 0.3, 0.05  # amplitudes of one term and of the others; one may hide the other
+ONE_TERM, OTHER_TERMS = 0.3, 0.05  # amplitudes of one term and of the others; one may hide the other
 LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the block's own kernel: no mode is forbidden
 FITTED = 0.5  # of a kind's residuals, the largest share that is taken for fitted by the unknowns
 
@@ -307,7 +307,7 @@ def _most_evident(
         return -evidence, -2.0 * squares * slopes
 
     limits = np.log(block.amplitudes)
-    starts = np.log(np.where(np.eye(len(terms)) > 0.0, FIRST, ELSEWHERE)).clip(*limits)
+    starts = np.log(np.where(np.eye(len(terms)) > 0.0, ONE_TERM, OTHER_TERMS)).clip(*limits)
     found = [
         optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=[tuple(limits)] * len(terms))
         for start in starts

@@ -32,7 +32,7 @@ from palpate.observation.contract import seen_by
 from palpate.progress import silent
 
 NOISE = 0.5  # of the objective: that of closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
-INNER = 1e-4  # decrement of a minimum on linear residuals
+INNER = 1e-4  # of the objective: decrement of a minimum on linear residuals, and change by hyper-parameters, that end
 SETTLES = 6  # iterations, after which numbers of independent residuals stay, and the trust region no longer grows
 LEAST_SD = 0.03  # of ln E, see `_linearisation`
 
@@ -96,8 +96,7 @@ class OuterIterate:
     """Where an iteration ended: a minimum under the objective that it was found with.
 
     checks: what it cost to state the approximations' errors; totals: J before and after each accepted step, by one
-    linearisation's determinants; exact: whether the approximations were made exact there;
-    correlated: how often the numbers of independent residuals have been taken anew.
+    linearisation's determinants; correlated: how often the numbers of independent residuals have been taken anew.
     """
 
     objective: Objective
@@ -105,7 +104,6 @@ class OuterIterate:
     convergence: Convergence = Convergence()
     checks: SolveCounts = field(default_factory=SolveCounts)
     totals: tuple[tuple[float, float], ...] = ()
-    exact: bool = False
     correlated: int = 0
 
     @property
@@ -304,14 +302,13 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
     _, off, cost = model_error(objective, minimum)
     missing = float(np.max(off / (rule.model_error * tolerance), initial=0.0))
     left = float(np.max(_linearisation(objective, minimum) / tolerance, initial=0.0)) if rule.derivatives else 0.0
-    checks, matters = now.checks + cost, max(missing, left) >= 1.0
-    judged = minimum.evaluation
-    if matters:
+    checks, judged = now.checks + cost, minimum.evaluation
+    if max(missing, left) >= 1.0:
         places = objective.linearisation_points(unknowns, minimum.evaluation)
         pairs = zip(objective.approximations, places, strict=True)
         objective = objective.under([approximation.update(place) for approximation, place in pairs])
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
-    there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals, exact=matters)
+    there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals)
     return replace(there, correlated=correlated), judged, spent
 
 

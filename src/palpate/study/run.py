@@ -261,8 +261,8 @@ def refuse_what_cannot_be_estimated(case: Case) -> None:
         )
     if case.estimate.method != "gauss-newton":
         raise ConfigurationError(
-            f"[estimate] method = '{case.estimate.method}' is no longer there: it ended where 'gauss-newton' does, and"
-            " took longer; write that, or leave the key out"
+            f"[estimate] method = '{case.estimate.method}' is none: write 'gauss-newton', which ends at the same"
+            " minimum, or leave the key out"
         )
     movers = [tissue for tissue in case.tissues if tissue.role in (Role.DRIVER, Role.RIGID)]
     if case.tissues and case.images is not None and not movers and not case.loads and not case.data:
