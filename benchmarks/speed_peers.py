@@ -46,7 +46,7 @@ def frozen_misfit(objective: Objective, unknowns: Array) -> FrozenMisfit:
     designs, rests = [], []
     for line in objective(unknowns).linearisations:
         scale, dofs = np.sqrt(line.precision * line.weights), line.observation.dofs
-        plane = sparse.csr_matrix(sparse.diags_array(scale) @ line.residuals.smooth_jacobian)
+        plane = sparse.csr_matrix(sparse.diags_array(scale) @ line.residuals.jacobian)
         spread = sparse.csr_matrix((np.ones(len(dofs)), (np.arange(len(dofs)), dofs)), shape=(len(dofs), n_dof))
         designs.append(sparse.csr_matrix(plane @ spread))
         rests.append(scale * line.residuals.values - plane @ values[dofs])

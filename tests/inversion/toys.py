@@ -30,9 +30,7 @@ class Quadratic:
     def __call__(self, unknowns):
         slope = self.curvature @ (unknowns - self.centre)
         value = self.value(unknowns)
-        return Evaluation(
-            value, value, slope, self.pull * slope, self.curvature.copy(), (), 0.0 * self.curvature, 0.0 * slope
-        )
+        return Evaluation(value, value, self.pull * slope, self.curvature.copy(), (), 0.0 * self.curvature, 0.0 * slope)
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ class Saturating:
         score = slope * (slope - np.exp(self.truth))
         matrix = np.diag(slope**2)
         value = self.value(unknowns)
-        return Evaluation(value, value, score, score, matrix, (), 0.0 * matrix, 0.0 * score)
+        return Evaluation(value, value, score, matrix, (), 0.0 * matrix, 0.0 * score)
 
 
 def coupled(rng, n=5, centre=None):

@@ -40,7 +40,7 @@ class PointMotion:
         places = np.tile(self.rest + displacement, (3, 1))
         material = np.tile(self.rest, (3, 1))
         weights = np.full(3, 1.0 / 3.0)
-        return Residuals(displacement - self.seen + offset, weights, places, np.eye(3), material, identity, identity)
+        return Residuals(displacement - self.seen + offset, weights, places, np.eye(3), material, identity)
 
     def with_noise(self, noise):
         return replace(self, noise_model=noise, weighting=Weighting(3.0 / noise.sd**2, PowerLaw(), 3.0))

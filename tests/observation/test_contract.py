@@ -168,45 +168,27 @@ def test_residuals_have_the_shapes_that_are_promised(case):
     for triple in (found.places, found.normals, found.material):
         assert triple.shape == (n, 3)
     assert np.linalg.norm(found.normals, axis=1) == pytest.approx(np.ones(n))
-    for jacobian in (found.jacobian, found.smooth_jacobian):
-        assert jacobian.shape == (n, n_seen(case.seen))
+    assert found.jacobian.shape == (n, n_seen(case.seen))
     assert case.seen.kind
     assert case.seen.name
     assert 0.0 < case.seen.observed_share <= 1.0
 
 
-@pytest.mark.parametrize("make", [of_smooth_surfaces, of_point, of_points, of_markers, of_means, of_force])
-def test_the_exact_jacobian_leaves_a_remainder_of_second_order(make, sphere, point_motion, rng):
-    """Of nine residuals in ten: of the others the closest point jumps to another triangle."""
-    seen = make(sphere, point_motion)
+@pytest.mark.parametrize("make", [of_point, of_points, of_markers, of_means, of_force])
+def test_the_jacobian_is_that_of_central_differences(make, sphere, point_motion, rng):
+    """Of all kinds but surfaces, whose sliding it leaves out (see test_surface_residuals.py)."""
+    seen, h = make(sphere, point_motion), 1e-3
     place, direction = 0.3 * rng.standard_normal((2, n_seen(seen)))
-    start = seen.residuals(place)
-    slope = start.jacobian @ direction
-    remainders = [
-        np.quantile(np.abs(seen.residuals(place + h * direction).values - start.values - h * slope), 0.9) for h in STEPS
-    ]
-    if max(remainders) < 1e-14:  # linear
-        return
-    assert np.all(np.diff(np.log(remainders)) / np.diff(np.log(STEPS)) > 1.9)
+    high, low = (seen.residuals(place + sign * h * direction).values for sign in (1.0, -1.0))
+    slope = seen.residuals(place).jacobian @ direction
+    assert np.linalg.norm(slope) > 0.0
+    assert (high - low) / (2.0 * h) == pytest.approx(slope, rel=1e-8, abs=1e-10)
 
 
-def test_a_changed_jacobian_would_leave_one_of_first_order(sphere, point_motion, rng):
-    """The law above can fail."""
-    seen = of_smooth_surfaces(sphere, point_motion)
-    place, direction = 0.3 * rng.standard_normal((2, n_seen(seen)))
-    start = seen.residuals(place)
-    slope = 1.001 * (start.jacobian @ direction)
-    remainders = [
-        np.quantile(np.abs(seen.residuals(place + h * direction).values - start.values - h * slope), 0.9) for h in STEPS
-    ]
-    assert np.diff(np.log(remainders))[-1] / np.diff(np.log(STEPS))[-1] < 1.9
-
-
-def test_the_jacobians_and_their_transposes_are_adjoint(case, rng):
+def test_the_jacobian_and_its_transpose_are_adjoint(case, rng):
     found = case.residuals
-    for jacobian in (found.jacobian, found.smooth_jacobian):
-        motion, pull = rng.standard_normal(jacobian.shape[1]), rng.standard_normal(jacobian.shape[0])
-        assert (jacobian @ motion) @ pull == pytest.approx(motion @ (jacobian.T @ pull), rel=1e-10)
+    motion, pull = (rng.standard_normal(n) for n in found.jacobian.shape[::-1])
+    assert (found.jacobian @ motion) @ pull == pytest.approx(motion @ (found.jacobian.T @ pull), rel=1e-10)
 
 
 def test_weights_sum_to_one_whatever_has_been_done(case):

@@ -33,7 +33,7 @@ class Bowl:
         matrix[:2, :2] = self.precision
         slope = matrix @ (unknowns - self.centre)
         value = 0.5 * float(slope @ (unknowns - self.centre))
-        return Evaluation(value, value, slope, slope, matrix, (), 0.0 * matrix, 0.0 * slope)
+        return Evaluation(value, value, slope, matrix, (), 0.0 * matrix, 0.0 * slope)
 
 
 @pytest.fixture(scope="module")

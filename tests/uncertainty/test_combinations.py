@@ -34,7 +34,7 @@ class Toy:
     def __call__(self, theta):
         r, slopes, none = self.residuals(theta), self.derivatives(theta), np.zeros((2, 2))
         pull = slopes.T @ r
-        return Evaluation(0.5 * float(r @ r), 0.0, pull, pull, slopes.T @ slopes, (), none, np.zeros(2))
+        return Evaluation(0.5 * float(r @ r), 0.0, pull, slopes.T @ slopes, (), none, np.zeros(2))
 
 
 def parabola(covariance):

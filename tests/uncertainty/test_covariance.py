@@ -58,17 +58,9 @@ class Seen:
 def surface(places, normals, jacobian, *, precision, noise, state=0, kind="surface distance", of_driver=False):
     n = len(places)
     weights = np.full(n, 1.0 / n)
-    residuals = Residuals(np.zeros(n), weights, places, normals, places, None, None)
-    columns = np.arange(jacobian.shape[1])
-    return Linearisation(
-        Seen(noise, Weighting(precision, PowerLaw()), state, kind, of_driver),
-        state,
-        residuals,
-        columns,
-        Jacobian.of(jacobian),
-        weights,
-        None,
-    )
+    residuals = Residuals(np.zeros(n), weights, places, normals, places, None)
+    seen = Seen(noise, Weighting(precision, PowerLaw()), state, kind, of_driver)
+    return Linearisation.of(seen, state, residuals, np.arange(jacobian.shape[1]), Jacobian.of(jacobian), weights)
 
 
 def test_what_neither_images_nor_prior_determine_ends_as_an_estimation_that_says_so(toys):
@@ -93,13 +85,13 @@ def observed(*lines, n_parameters=2, rests=(0, 1)):
     prior = np.diag(np.where(np.arange(n) < n_parameters, 0.0, 1.0))
     matrix = prior.copy()
     for line in lines:
-        matrix += line.jacobian.gram(line.precision * line.weights)
+        matrix += line.information
     numbers = sorted({line.state for line in lines})
     states = [
         LaterState(None, tuple(line.observation for line in lines if line.state == s), reference=rests[s])
         for s in numbers
     ]
-    evaluation = Evaluation(0.0, 0.0, np.zeros(n), np.zeros(n), matrix, tuple(lines), prior, np.zeros(n))
+    evaluation = Evaluation(0.0, 0.0, np.zeros(n), matrix, tuple(lines), prior, np.zeros(n))
     return Objective(tuple(states), parameters), evaluation
 
 

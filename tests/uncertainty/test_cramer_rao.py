@@ -55,11 +55,11 @@ def seen(jacobian):
     n, weights = len(places), np.full(len(places), 1.0 / len(places))
     target = SimpleNamespace(area=np.ones(n), surface=SimpleNamespace(driver=False))
     surface = SurfaceDistance(target, None, NOISE, Weighting(PRECISION, PowerLaw()), stated_noise=NOISE)
-    residuals = Residuals(np.zeros(n), weights, places, normals, places, None, None)
-    line = Linearisation(surface, 0, residuals, np.arange(5), Jacobian.of(jacobian), weights, None)
+    residuals = Residuals(np.zeros(n), weights, places, normals, places, None)
+    line = Linearisation(surface, 0, residuals, np.arange(5), Jacobian.of(jacobian), weights, None, None)
     prior = np.diag([0.0, 0.0, 1.0, 1.0, 1.0])
     matrix = prior + PRECISION * jacobian.T @ (weights[:, None] * jacobian)
-    evaluation = Evaluation(0.0, 0.0, np.zeros(5), np.zeros(5), matrix, (line,), prior, np.zeros(5))
+    evaluation = Evaluation(0.0, 0.0, np.zeros(5), matrix, (line,), prior, np.zeros(5))
     parameters = ParameterMap(np.ones(2), np.eye(2), ("a", "b"), "c", True, unit_blocks(3))
     return Objective((LaterState(None, (surface,)),), parameters), evaluation
 
@@ -126,7 +126,7 @@ def test_points_tell_what_their_stated_covariance_leaves(limits, smooth):
     term = point_displacement(space, points, np.zeros((20, 3)), places, file=file, description="")
     told = Jacobian.of(term.whitening @ seen_by(term, tangent))
     doubtful = term.with_noise(NoiseModel(np.array([4.0]), np.array([1.0])))
-    line = Linearisation(doubtful, 0, None, np.arange(5), told, np.full(60, 1.0 / 60.0), None)
+    line = Linearisation(doubtful, 0, None, np.arange(5), told, np.full(60, 1.0 / 60.0), None, None)
     evaluation = replace(smooth[1], linearisations=(*smooth[1].linearisations, line))
     whole = np.kron(point_interpolation(space, places).toarray(), np.eye(3)) @ tangent
     expected = whole.T @ np.linalg.solve(np.kron(np.eye(20), file.covariance_mm2), whole)

@@ -26,7 +26,7 @@ ONE = np.ones(1)  # the coordinate of what no unknown moves
 class FixedCorrespondence:
     """An objective whose closest points are those of one evaluation; the model bends as it does.
 
-    Residuals are r_0 + S (u(E, q) - u_0) with the smooth Jacobians S by the displacement, and count by the robust
+    Residuals are r_0 + S (u(E, q) - u_0) with the Jacobians S by the displacement, and count by the robust
     weights w_0 there, as in the Gauss-Newton matrix: J = 1/2 sum_j precision w_0j r_j^2 + prior. What re-chosen closest
     points add, some tenths of a unit, is noise beside its second derivative, and far away a robust loss would take
     every residual for an outlier. unknowns (n_unknowns,): those of the evaluation; models: of each state, at its
@@ -45,7 +45,7 @@ class FixedCorrespondence:
         return self.objective.n_parameters
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
-        """J at `unknowns` (n_unknowns,) with gradient and Gauss-Newton matrix; raises `SolverError`."""
+        """J at `unknowns` (n_unknowns,) with score and Gauss-Newton matrix; raises `SolverError`."""
         mapping, lines = self.objective.parameters, list[Linearisation]()
         left = iter(zip(self.lines, self.displacements, strict=True))
         moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
@@ -59,9 +59,8 @@ class FixedCorrespondence:
                 moved = np.concatenate([there.values[rows] - before, [by_offset], material])
                 values = line.residuals.values + line.jacobian.by_displacement @ moved
                 jacobian = line.jacobian.under(tangent[rows])
-                gradient = jacobian.transposed_times(line.precision * line.weights * values)
                 residuals = replace(line.residuals, values=values)
-                lines.append(replace(line, residuals=residuals, jacobian=jacobian, gradient=gradient))
+                lines.append(Linearisation.of(line.observation, s, residuals, line.columns, jacobian, line.weights))
         found = self.objective.assembled(unknowns, lines)
         away = float((unknowns - mapping.prior_centre) @ found.prior_score)
         squares = sum(line.precision * float(line.weights @ line.residuals.values**2) for line in lines)
@@ -149,14 +148,14 @@ class FrozenPosterior:
         return total
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
-        """Its value, gradient and Gauss-Newton matrix at unknowns (n,), without residuals; raises `SolverError`.
+        """Its value, score and Gauss-Newton matrix at unknowns (n,), without residuals; raises `SolverError`.
 
-        With D_s = d z_s / dx the gradient is sum_s D_s^T Q_s z_s + P (x - m), the matrix sum_s D_s^T Q_s D_s + P.
+        With D_s = d z_s / dx the score is sum_s D_s^T Q_s z_s + P (x - m), the matrix sum_s D_s^T Q_s D_s + P.
         """
         parameters = self.objective.parameters
         moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
         pull = self.prior @ away
-        value, gradient, matrix, misfit = 0.5 * float(away @ pull), pull.copy(), self.prior.copy(), 0.0
+        value, score, matrix, misfit = 0.5 * float(away @ pull), pull.copy(), self.prior.copy(), 0.0
         for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
             offsets, own = parameters.offsets(unknowns, s), parameters.unknowns_of(s)
             z = state.coordinates(moduli, coefficients, offsets)
@@ -164,9 +163,9 @@ class FrozenPosterior:
             force = state.form @ z
             value += 0.5 * float(z @ force)
             misfit += float(z @ (state.square @ z))
-            gradient[own] += slopes.T @ force
+            score[own] += slopes.T @ force
             matrix[np.ix_(own, own)] += slopes.T @ (state.form @ slopes)
-        return Evaluation(value, misfit, gradient, gradient, matrix, (), self.prior, pull)
+        return Evaluation(value, misfit, score, matrix, (), self.prior, pull)
 
 
 def frozen_posterior(

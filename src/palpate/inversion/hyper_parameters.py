@@ -77,8 +77,7 @@ def _scale(lines: Sequence[Linearisation], inverse: NDArray[np.float64], least: 
     count = sum(line.observation.weighting.count for line in lines)
     determine = 0.0
     for line in lines:
-        gram = line.jacobian.gram(line.precision * line.weights)
-        determine += float(np.sum(inverse[np.ix_(line.columns, line.columns)] * gram))
+        determine += float(np.sum(inverse[np.ix_(line.columns, line.columns)] * line.information))
     low = max(least, *(line.observation.sd_bounds[0] for line in lines))
     high = min(line.observation.sd_bounds[1] for line in lines)
     if high <= low:

@@ -25,9 +25,9 @@ AS_GOOD = 1.92  # of minus the log posterior: half the 95 % quantile of chi-squa
 class Linearisation:
     """One observation of one `state` at some unknowns: its residuals, robust weights (n,) and derivatives.
 
-    columns (n_columns,): the unknowns that move it, the log-moduli and its own state's coefficients. jacobian (n,
-    n_columns): by the observation's smooth Jacobian; gradient (n_columns,): the exact one of precision / 2 sum w
-    rho(r).
+    columns (n_columns,): the unknowns that move it, the log-moduli and its own state's coefficients. jacobian J (n,
+    n_columns); score (n_columns,) J^T W r and information (n_columns, n_columns) J^T W J, W = precision
+    diag(weights): what it adds to those of the objective.
     """
 
     observation: Observation
@@ -36,26 +36,43 @@ class Linearisation:
     columns: NDArray[np.int64]
     jacobian: Jacobian
     weights: NDArray[np.float64]
-    gradient: NDArray[np.float64]
+    score: NDArray[np.float64]
+    information: NDArray[np.float64]
 
     @property
     def precision(self) -> float:
         """Weight of the mean square, mm^-2."""
         return self.observation.weighting.precision
 
+    @classmethod
+    def of(
+        cls,
+        observation: Observation,
+        state: int,
+        residuals: Residuals,
+        columns: NDArray[np.int64],
+        jacobian: Jacobian,
+        weights: NDArray[np.float64] | None = None,
+    ) -> Linearisation:
+        """That of residuals with a Jacobian (n, n_columns); weights (n,): None, robust ones by the loss."""
+        if weights is None:
+            weights = residuals.weights * observation.weighting.loss.weight(residuals.values)
+        believed = observation.weighting.precision * weights
+        score, information = jacobian.transposed_times(believed * residuals.values), jacobian.gram(believed)
+        return cls(observation, state, residuals, columns, jacobian, weights, score, information)
+
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Value (dimensionless, minus log-posterior) with its exact gradient (n,), and the Gauss-Newton system.
+    """Value (dimensionless, minus log-posterior) and the Gauss-Newton system.
 
-    matrix (n, n) = J^T W J + P and score (n,) = J^T W r + P (x - m) with the smooth Jacobians: the estimate is where
-    the score vanishes. prior (n, n): P, the precision of the unknowns before the images are seen; prior_score (n,): its
-    part of the score.
+    matrix (n, n) = J^T W J + P and score (n,) = J^T W r + P (x - m) with the Jacobians J of smooth surfaces: the
+    estimate is where the score vanishes. prior (n, n): P, the precision of the unknowns before the images are seen;
+    prior_score (n,): its part of the score.
     """
 
     value: float
     misfit_mm2: float
-    gradient: NDArray[np.float64]
     score: NDArray[np.float64]
     matrix: NDArray[np.float64]
     linearisations: tuple[Linearisation, ...]
@@ -168,7 +185,6 @@ class Objective:
         return objective, replace(
             evaluation,
             value=evaluation.value - before + value,
-            gradient=evaluation.gradient + moved,
             score=evaluation.score + moved,
             matrix=evaluation.matrix - evaluation.prior + prior,
             prior=prior,
@@ -190,7 +206,7 @@ class Objective:
         return total
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
-        """J with gradient, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
+        """J with score, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
         lines = [line for s in range(len(self.states)) for line in self._linearised(s, unknowns)]
         return self.assembled(unknowns, lines)
 
@@ -198,34 +214,13 @@ class Objective:
         """The evaluation at `unknowns` (n_unknowns,) from all observations' residuals there, with their derivatives."""
         value, pull = _prior(self.parameters, unknowns)
         prior = self.parameters.prior_matrix
-        gradient, score, matrix = pull.copy(), pull.copy(), prior.copy()
-        misfit = 0.0
-        for line, (own_score, own_matrix) in zip(lines, mapped(_normal_equations, lines), strict=True):
-            gradient[line.columns] += line.gradient
-            score[line.columns] += own_score
-            matrix[np.ix_(line.columns, line.columns)] += own_matrix
+        score, matrix, misfit = pull.copy(), prior.copy(), 0.0
+        for line in lines:
+            score[line.columns] += line.score
+            matrix[np.ix_(line.columns, line.columns)] += line.information
             misfit += _mean_loss(line.observation, line.residuals) / len(lines)
             value += _misfit(line.observation, line.residuals)
-        return Evaluation(value, misfit, gradient, score, matrix, tuple(lines), prior, pull)
-
-    def value_and_gradient(self, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """J and its exact gradient (n_unknowns,) by one adjoint solve a state, without the Gauss-Newton system."""
-        value, gradient = _prior(self.parameters, unknowns)
-        for s in range(len(self.states)):
-            solution = self._equilibrium(s, unknowns)
-            seen = self._residuals(s, solution.values, unknowns)
-            value += sum(_misfit(*of) for of in seen)
-            by_region = solution.adjoint(np.concatenate([_pull(*of) for of in seen]))[None]
-            pulls = {observation.name: _weighted(observation, residuals).sum() for observation, residuals in seen}
-            by_offset = [pulls[name] for name in self.parameters.offset_names(s)]
-            by_model = self.parameters.by_unknowns(by_region, unknowns)[0]
-            for observation, residuals in seen:
-                if residuals.direct is not None:
-                    pull = residuals.direct.T @ _weighted(observation, residuals)
-                    by_model = by_model + self._by_material(s, unknowns).T @ pull
-            own = np.concatenate([by_model, by_offset])
-            gradient[self.parameters.unknowns_of(s)] += own
-        return value, gradient
+        return Evaluation(value, misfit, score, matrix, tuple(lines), prior, pull)
 
     def rematched(self, unknowns: NDArray[np.float64]) -> Objective:
         """The same with what belongs together in model and image chosen anew at unknowns (n_unknowns,).
@@ -289,18 +284,10 @@ class Objective:
         def line(of: tuple[slice, tuple[Observation, Residuals]]) -> Linearisation:
             """One observation's residuals with their derivative."""
             rows, (observation, residuals) = of
-            number = numbers.get(observation.name)
-            weights = residuals.weights * observation.weighting.loss.weight(residuals.values)
-            smooth, seen_by = residuals.smooth_jacobian, tangent[rows]
             direct = None if residuals.direct is None else (residuals.direct, self._by_material(s, unknowns))
-            jacobian = jacobian_of(smooth, seen_by, number=number, n_offsets=n_offsets, direct=direct)
-            weighted = _weighted(observation, residuals)
-            own = np.zeros(n_offsets)
-            own[[] if number is None else number] = weighted.sum()
-            by_model = seen_by.T @ (residuals.jacobian.T @ weighted)
-            by_model = by_model if direct is None else by_model + direct[1].T @ (direct[0].T @ weighted)
-            gradient = np.concatenate([by_model, own])
-            return Linearisation(observation, s, residuals, columns, jacobian, weights, gradient)
+            number = numbers.get(observation.name)
+            jacobian = jacobian_of(residuals.jacobian, tangent[rows], number=number, n_offsets=n_offsets, direct=direct)
+            return Linearisation.of(observation, s, residuals, columns, jacobian)
 
         return mapped(line, zip(state.slices, seen, strict=True))
 
@@ -325,7 +312,7 @@ class LinearisedObjective:
         return self.objective.n_parameters
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
-        """J at `unknowns` (n_unknowns,) with the residuals r + J (x - x_0) by the smooth Jacobians."""
+        """J at `unknowns` (n_unknowns,) with the residuals r + J (x - x_0) by the Jacobians."""
         step = unknowns - self.unknowns
 
         def line(of: tuple[Observation, Linearisation]) -> Linearisation:
@@ -333,9 +320,7 @@ class LinearisedObjective:
             observation, known = of
             values = known.residuals.values + known.jacobian.times(step[known.columns])
             residuals = observation.weighed(replace(known.residuals, values=values))
-            weights = residuals.weights * observation.weighting.loss.weight(values)
-            gradient = known.jacobian.transposed_times(observation.weighting.precision * weights * values)
-            return replace(known, observation=observation, residuals=residuals, weights=weights, gradient=gradient)
+            return Linearisation.of(observation, known.state, residuals, known.columns, known.jacobian)
 
         lines = mapped(line, zip(self.objective.observations, self.evaluation.linearisations, strict=True))
         found = self.objective.assembled(unknowns, lines)
@@ -343,13 +328,7 @@ class LinearisedObjective:
             return found
         ridge = self.damping * np.diag(self.evaluation.matrix)
         value, pull = found.value + 0.5 * float(step @ (ridge * step)), ridge * step
-        return replace(
-            found,
-            value=value,
-            gradient=found.gradient + pull,
-            score=found.score + pull,
-            matrix=found.matrix + np.diag(ridge),
-        )
+        return replace(found, value=value, score=found.score + pull, matrix=found.matrix + np.diag(ridge))
 
 
 def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np.float64]:
@@ -362,12 +341,6 @@ def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np
     """
     unit = np.eye(len(evaluation.matrix))[:, :n_parameters]
     return np.concatenate([unit, evaluation.covariance_columns(n_parameters)], axis=1)
-
-
-def _normal_equations(line: Linearisation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """J^T W r (n_columns,) and J^T W J (n_columns, n_columns) of one observation."""
-    weights = line.precision * line.weights
-    return line.jacobian.transposed_times(weights * line.residuals.values), line.jacobian.gram(weights)
 
 
 def worse_driver(sd: float, kind_sd: float) -> float:
@@ -384,18 +357,6 @@ def log_det(matrix: NDArray[np.float64]) -> float:
 def _misfit(observation: Observation, residuals: Residuals) -> float:
     """What an observation adds to the objective, dimensionless."""
     return 0.5 * observation.weighting.precision * _mean_loss(observation, residuals)
-
-
-def _weighted(observation: Observation, residuals: Residuals) -> NDArray[np.float64]:
-    """Derivative (n,) of that by the residuals, 1/mm."""
-    weighting = observation.weighting
-    weights = residuals.weights * weighting.loss.weight(residuals.values)
-    return np.asarray(weighting.precision * weights * residuals.values)
-
-
-def _pull(observation: Observation, residuals: Residuals) -> NDArray[np.float64]:
-    """Derivative (n_dofs,) of that by the observation's displacement, 1/mm."""
-    return np.asarray(residuals.jacobian.T @ _weighted(observation, residuals))
 
 
 def _mean_loss(observation: Observation, residuals: Residuals) -> float:

@@ -138,7 +138,7 @@ class _Step:
         """By how much J falls on a way from unknowns (n,) to where it is `judged`, and on linear residuals.
 
         By the scores at both ends, -1/2 (s + s')^T d: closest points that slide over voxels are noise of J, as large as
-        what moduli promise, that the score, by the smooth Jacobians, does not have.
+        what moduli promise, that the score, by the Jacobians of smooth surfaces, does not have.
         """
         d = self.minimum.unknowns - unknowns
         ends = judged.score, self.minimum.evaluation.score
@@ -336,7 +336,7 @@ def model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray[
     """What the approximations miss at a minimum: the largest error in energy, and what it cost to know.
 
     Between them by how much it sets the log-moduli off (n_parameters,): |H^-1 J^T W S du|, with the displacement du
-    that is missing, the residuals' smooth derivatives S by it and the Gauss-Newton matrix H = J^T W J + P; infinite
+    that is missing, the residuals' derivatives S by it and the Gauss-Newton matrix H = J^T W J + P; infinite
     where an approximation cannot say.
     """
     pairs = list(zip(objective.approximations, objective.linearisation_points(minimum.unknowns), strict=True))
@@ -348,7 +348,7 @@ def model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray[
     pull = np.zeros(len(minimum.unknowns))
     for line in minimum.evaluation.linearisations:
         du = seen_by(line.observation, errors[line.state].missing)
-        missing = np.asarray(line.residuals.smooth_jacobian @ du)
+        missing = np.asarray(line.residuals.jacobian @ du)
         pull[line.columns] += line.jacobian.transposed_times(line.precision * line.weights * missing)
     off = np.abs(minimum.evaluation.covariance_columns(objective.n_parameters).T @ pull)
     return largest, np.asarray(off), cost

@@ -46,9 +46,9 @@ class Residuals:
 
     values (n,) mm, or the observation's unit; weights (n,), dimensionless, their sum 1; places (n, 3) mm in the
     deformed body and normals (n, 3): where each was taken and along which direction; material (n, 3) mm: the same
-    places at rest. jacobian (n, n_seen): the exact d values / d displacement of what the observation sees.
-    smooth_jacobian: the same without what only image noise makes of it (that of the exact one where there is no such
-    thing). distances (m,) mm: of what is compared, where the residuals are not these themselves. direct (n, n_regions +
+    places at rest.
+    jacobian (n, n_seen): d values / d displacement of what the observation sees, without what only image noise makes of
+    it. distances (m,) mm: of what is compared, where the residuals are not these themselves. direct (n, n_regions +
     n_material): their derivatives by ln E and the material's coefficients at a held displacement, where they have any.
     shares (n,): weights by area alone, where the noise model changes them.
     """
@@ -59,7 +59,6 @@ class Residuals:
     normals: NDArray[np.float64]
     material: NDArray[np.float64]
     jacobian: sparse.csr_matrix[np.float64]
-    smooth_jacobian: sparse.csr_matrix[np.float64]
     distances: NDArray[np.float64] | None = None
     direct: NDArray[np.float64] | None = None
     shares: NDArray[np.float64] | None = None

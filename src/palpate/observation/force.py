@@ -85,7 +85,7 @@ class Force:
         centre, row = self.reaction.centre[None], sparse.csr_matrix(by_displacement[None])
         values = np.array([value + offset - self.measured])
         along = self.direction[None]
-        return Residuals(values, np.ones(1), centre, along, centre, row, row, direct=direct[None])
+        return Residuals(values, np.ones(1), centre, along, centre, row, direct=direct[None])
 
     def by_poisson(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives (1, n_regions) N of the residual by the regions' Poisson's ratios at displacements (n_dofs,) mm.

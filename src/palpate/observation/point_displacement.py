@@ -62,7 +62,7 @@ class PointDisplacement:
         weights = np.full(n, 1.0 / n)
         motions = self.point_motions(displacement)
         away = np.linalg.norm(motions.fitted - motions.observed, axis=1)
-        return Residuals(values, weights, self.material, self.axes, self.material, self.whitening, self.whitening, away)
+        return Residuals(values, weights, self.material, self.axes, self.material, self.whitening, away)
 
     def point_motions(self, displacement: NDArray[np.float64]) -> PointMotions:
         """The points, or means of some, as measured and at their displacements (n,) mm."""

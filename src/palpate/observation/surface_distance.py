@@ -103,7 +103,7 @@ class SurfaceDistance:
         A surface that is drawn by an offset (mm) further out is the deformed one moved so far along its normals: both
         are compared where they meet. Added to the distance instead, it would be rewarded for leading away from the
         surface, where a distance map has less of the voxels' noise.
-        The smooth Jacobian is that of a smooth surface without noise, n . du. The exact one also holds how voxel noise
+        Their derivative is that of a smooth surface without noise, n . du. An exact one would also hold how voxel noise
         and facets change as the surface slides along itself, which tells nothing of how it slides.
         """
         found = surface_residuals(self.target, self._drawn(displacement, offset), self.held)

@@ -17,11 +17,6 @@ from palpate.observation.target import SurfaceTarget, places_within, values_and_
 
 T = TypeVar("T", bound=np.generic)
 ON_EDGE = 1e-9
-# Directions (8, 2, 3) in barycentric coordinates along which a closest point may slide, zero where none: by which
-# corners have no share in it (1, 2, 4 added up). Inside there are two, on an edge one, at a corner none.
-SLIDES = np.zeros((8, 2, 3))
-SLIDES[0] = [[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]]
-SLIDES[1, 0], SLIDES[2, 0], SLIDES[4, 0] = [0.0, -1.0, 1.0], [-1.0, 0.0, 1.0], [-1.0, 1.0, 0.0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +51,7 @@ class _Closest:
 class _Direction:
     """Residuals (n,) of one direction of the distance, as `Residuals` has them.
 
-    corners (n, 3): vertices of the triangle of each; exact, smooth (n, 3 corners, 3 axes): derivatives by their motion.
+    corners (n, 3): vertices of the triangle of each; by_corners (n, 3 corners, 3 axes): derivatives by their motion.
     """
 
     values: NDArray[np.float64]
@@ -65,14 +60,15 @@ class _Direction:
     normals: NDArray[np.float64]
     material: NDArray[np.float64]
     corners: NDArray[np.int64]
-    exact: NDArray[np.float64]
-    smooth: NDArray[np.float64]
+    by_corners: NDArray[np.float64]
 
 
 def surface_residuals(target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence) -> Residuals:
-    """Residuals and their exact derivative at a displacement (n_vertices, 3) mm of the surface's points.
+    """Residuals and their derivative at a displacement (n_vertices, 3) mm of the surface's points.
 
     model -> image first, then image -> model (see `SurfaceDistance`), each with half of the weight, shared out by area.
+    The derivative is that of smooth surfaces, along the model's normal; what the image's voxels add to it, along the
+    surface and by the closest points that slide, is noise.
     """
     vertices = target.surface.rest + displacement
     normals = vertex_normals(vertices, target.surface.triangles)
@@ -80,16 +76,14 @@ def surface_residuals(target: SurfaceTarget, displacement: NDArray[np.float64], 
     corners = np.concatenate([d.corners for d in both])
     columns = (3 * corners[:, :, None] + np.arange(3)).ravel()
     starts, shape = 9 * np.arange(len(corners) + 1), (len(corners), 3 * len(vertices))
-    rows = (np.concatenate([d.exact for d in both]), np.concatenate([d.smooth for d in both]))
-    exact, smooth = (sparse.csr_matrix((of.ravel(), columns, starts), shape=shape) for of in rows)
+    by_corners = np.concatenate([d.by_corners for d in both])
     return Residuals(
         np.concatenate([d.values for d in both]),
         np.concatenate([d.weights for d in both]),
         np.concatenate([d.places for d in both]),
         np.concatenate([d.normals for d in both]),
         np.concatenate([d.material for d in both]),
-        exact,
-        smooth,
+        sparse.csr_matrix((by_corners.ravel(), columns, starts), shape=shape),
     )
 
 
@@ -155,13 +149,12 @@ def _model_to_image(
     material, places = (places_within(of[corners], barycentric) for of in (target.surface.rest, vertices))
     distance, gradient = values_and_gradients(target.after, places)
     excess = np.einsum("qk,qk->q", barycentric, held.excess[corners])
-    exact = barycentric[:, :, None] * gradient[:, None]
     normal = _within(normals, corners, barycentric)
     slope = np.einsum("qa,qa->q", gradient, normal)
-    smooth = barycentric[:, :, None] * (slope[:, None] * normal)[:, None]
+    by_corners = barycentric[:, :, None] * (slope[:, None] * normal)[:, None]
     values = distance - held.of_model(target.rest_distance) - excess
     weights = 0.5 * area / max(float(area.sum()), 1e-30)
-    return _Direction(values, weights, places, normal, material, corners, exact, smooth)
+    return _Direction(values, weights, places, normal, material, corners, by_corners)
 
 
 def _image_to_model(
@@ -172,24 +165,18 @@ def _image_to_model(
     image = target.image_points[kept]
     closest = _closest(surface, vertices, image)
     corners = surface.triangles[closest.triangle]
-    deformed, rest = vertices[corners], surface.rest[corners]
     offset = closest.places - image
     plane = triangle_normals(vertices, surface.triangles)
     plane = (plane / np.maximum(_length(plane), 1e-30)[:, None])[closest.triangle]
     length = _length(offset)
     side = np.where(np.einsum("na,na->n", offset, plane) < 0.0, -1.0, 1.0)
-    direction = np.where(length[:, None] > 1e-9, (side / np.maximum(length, 1e-30))[:, None] * offset, plane)
-    material = places_within(rest, closest.barycentric)
-    at_vertices = held.excess[corners]
-    excess = np.einsum("nk,nk->n", closest.barycentric, at_vertices)
-    at_rest, gradient = values_and_gradients(target.before, material)
-    at_corners = np.einsum("nka,na->nk", rest, gradient) + at_vertices
-    exact = closest.barycentric[:, :, None] * direction[:, None] + _slide(closest, deformed, offset, at_corners)
+    material = places_within(surface.rest[corners], closest.barycentric)
+    excess = np.einsum("nk,nk->n", closest.barycentric, held.excess[corners])
     normal = _within(normals, corners, closest.barycentric)
-    smooth = closest.barycentric[:, :, None] * normal[:, None]
+    by_corners = closest.barycentric[:, :, None] * normal[:, None]
     weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
-    values = side * length - (at_rest - target.level) - excess
-    return _Direction(values, weights, closest.places, normal, material, corners, exact, smooth)
+    values = side * length - (target.before.at(material) - target.level) - excess
+    return _Direction(values, weights, closest.places, normal, material, corners, by_corners)
 
 
 def _within(
@@ -203,32 +190,6 @@ def _within(
 def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Lengths (n,) of vectors (n, 3)."""
     return np.asarray(np.sqrt(np.einsum("na,na->n", vectors, vectors)))
-
-
-def _slide(
-    closest: _Closest,
-    deformed: NDArray[np.float64],
-    offset: NDArray[np.float64],
-    at_corners: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Derivative (n, 3 corners, 3 axes) of -d_before - b at the closest material point, which slides with the model.
-
-    at_corners (n, 3): d_before + b to first order at its triangle's corners, up to a constant, mm. With tangents t_i,
-    Gram matrix G_ij = t_i . t_j and the closest-point condition (x - y) . t_i = 0:
-    G_ij d xi_j = -(t_i . sum_a N_a du_a + (x - y) . d t_i), on an edge with its one tangent, at a corner not at all.
-    """
-    along = SLIDES[(closest.barycentric < ON_EDGE) @ np.array([1, 2, 4])]  # (n, 2, 3 corners)
-    first, second = (np.einsum("nk,nka->na", along[:, i], deformed) for i in range(2))
-    change = np.einsum("nik,nk->ni", along, at_corners)
-    still = ~along.any(axis=2)
-    g11, g22 = (np.einsum("na,na->n", t, t) + still[:, i] for i, t in enumerate((first, second)))
-    g12 = np.einsum("na,na->n", first, second)
-    determinant = g11 * g22 - g12 * g12
-    rate = np.stack([g22 * change[:, 0] - g12 * change[:, 1], g11 * change[:, 1] - g12 * change[:, 0]], axis=1)
-    rate /= determinant[:, None]
-    slid = rate[:, :1] * first + rate[:, 1:] * second
-    by_corner = np.einsum("ni,nik->nk", rate, along)
-    return np.asarray(closest.barycentric[:, :, None] * slid[:, None] + by_corner[:, :, None] * offset[:, None])
 
 
 def _closest(surface: ObservedSurface, vertices: NDArray[np.float64], image: NDArray[np.float64]) -> _Closest:

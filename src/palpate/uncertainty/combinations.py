@@ -89,7 +89,6 @@ class _PairCoordinates:
         there = self.fixed(turn @ unknowns)
         return replace(
             there,
-            gradient=turn.T @ there.gradient,
             score=turn.T @ there.score,
             matrix=turn.T @ there.matrix @ turn,
             prior=turn.T @ there.prior @ turn,

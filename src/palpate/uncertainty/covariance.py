@@ -186,12 +186,12 @@ def _given_model(objective: Objective, evaluation: Evaluation) -> Evaluation:
     lines = []
     for line in evaluation.linearisations:
         inside = np.isin(line.columns, own)
-        columns = np.searchsorted(own, line.columns[inside])
-        lines.append(replace(line, columns=columns, jacobian=line.jacobian.of_columns(inside)))
+        columns, jacobian = np.searchsorted(own, line.columns[inside]), line.jacobian.of_columns(inside)
+        score, information = line.score[inside], line.information[np.ix_(inside, inside)]
+        lines.append(replace(line, columns=columns, jacobian=jacobian, score=score, information=information))
     within = np.ix_(own, own)
     return replace(
         evaluation,
-        gradient=evaluation.gradient[own],
         score=evaluation.score[own],
         matrix=evaluation.matrix[within],
         linearisations=tuple(lines),

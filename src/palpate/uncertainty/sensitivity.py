@@ -163,7 +163,7 @@ def law_errors(
 def _of_displacements(evaluation: Evaluation, changes: Sequence[NDArray[np.float64]]) -> Errors:
     """Changes of each observation's residuals, mm, by changes (n_dof, ...) mm of the states' displacements."""
     return tuple(
-        np.asarray(line.residuals.smooth_jacobian @ seen_by(line.observation, changes[line.state]))
+        np.asarray(line.residuals.jacobian @ seen_by(line.observation, changes[line.state]))
         for line in evaluation.linearisations
     )
 
@@ -200,7 +200,7 @@ def modulus_errors(objective: Objective, unknowns: NDArray[np.float64], evaluati
         tangent = state.observed.solve(place.moduli, place.coefficients).tangent()[:, : len(place.moduli)]
         for rows in state.slices:
             residuals = next(lines).residuals
-            by_moduli = np.asarray(residuals.smooth_jacobian @ tangent[rows])
+            by_moduli = np.asarray(residuals.jacobian @ tangent[rows])
             held = 0.0 if residuals.direct is None else residuals.direct[:, : len(place.moduli)]
             found.append(by_moduli + held)
     return tuple(found)
