@@ -11,6 +11,7 @@ from scipy import ndimage, special
 from palpate.images.label_image import VoxelGrid
 
 PROBIT_LIMIT = 2.5  # beyond so many sigma the smoothed indicator has lost the distance to rounding
+TRUNCATED = 5.0  # sigma, beyond which the Gaussian is none
 COHERENCE = 1.7  # variance times correlation area of the rounding on a patch along a grid plane, in voxel edges^4
 BORDER = 1.0  # voxels: nearer to the image's border the map is a continuation, not a measurement
 
@@ -108,25 +109,36 @@ def distance_map(mask: NDArray[np.bool_], grid: VoxelGrid, *, smoothing_mm: floa
     plane; far from it the Euclidean distance transform, blended over one sigma. `smoothing_mm` is sigma, mm. Without
     `far` the map ends in planes of 2.5 sigma, for what is asked near the surface: a third of the price.
     """
-    sigma = smoothing_mm / grid.spacing
-    share = ndimage.gaussian_filter(mask.astype(np.float64), sigma, mode="nearest", truncate=5.0)
-    near = -smoothing_mm * special.ndtri(np.clip(share, 1e-12, 1.0 - 1e-12))
-    weight = np.clip(np.abs(near) / smoothing_mm - (PROBIT_LIMIT - 1.0), 0.0, 1.0)
     limit = PROBIT_LIMIT * smoothing_mm
     if not far:
-        distance = np.clip(near, -limit, limit)
+        values = np.full(mask.shape, limit)
     elif not mask.any() or mask.all():
         size = float(np.linalg.norm(grid.spacing * grid.shape))
-        distance = np.full(mask.shape, -size if mask.all() else size)
+        values = np.full(mask.shape, -size if mask.all() else size)
     else:  # between voxel centres, less half a voxel so that it is zero on the faces between them
         half = 0.5 * float(grid.spacing.mean())
-        distance = np.where(
-            mask,
-            half - ndimage.distance_transform_edt(mask, sampling=grid.spacing),
-            ndimage.distance_transform_edt(~mask, sampling=grid.spacing) - half,
-        )
-    values = (1.0 - weight) * near + weight * distance
+        values = ndimage.distance_transform_edt(~mask, sampling=grid.spacing) - half
+        inside = window_around(mask, grid, reach_mm=float(grid.spacing.min()))
+        depth = ndimage.distance_transform_edt(mask[inside], sampling=grid.spacing)
+        values[inside] = np.where(mask[inside], half - depth, values[inside])
+    if mask.any():  # the smoothed indicator is none but around the mask
+        box = window_around(mask, grid, reach_mm=TRUNCATED * smoothing_mm + float(grid.spacing.max()))
+        indicator, sigma = mask[box].astype(np.float64), smoothing_mm / grid.spacing
+        share = ndimage.gaussian_filter(indicator, sigma, mode="nearest", truncate=TRUNCATED)
+        near = -smoothing_mm * special.ndtri(np.clip(share, 1e-12, 1.0 - 1e-12))
+        weight = np.clip(np.abs(near) / smoothing_mm - (PROBIT_LIMIT - 1.0), 0.0, 1.0)
+        values[box] = (1.0 - weight) * near + weight * (values[box] if far else np.clip(near, -limit, limit))
     return DistanceMap(ndimage.spline_filter(values, order=3, mode="mirror"), grid, smoothing_mm)
+
+
+def window_around(mask: NDArray[np.bool_], grid: VoxelGrid, *, reach_mm: float) -> tuple[slice, slice, slice]:
+    """Index ranges of the voxels within `reach_mm` of the box around `mask` (n_x, n_y, n_z), which is not empty."""
+    found = ndimage.find_objects(mask.astype(np.int8))[0]
+    margin = np.ceil(reach_mm / grid.spacing).astype(int)
+    i, j, k = (
+        slice(max(s.start - m, 0), min(s.stop + m, n)) for s, m, n in zip(found, margin, mask.shape, strict=True)
+    )
+    return (i, j, k)
 
 
 def terrace_power(distance: DistanceMap, normals: NDArray[np.float64]) -> NDArray[np.float64]:

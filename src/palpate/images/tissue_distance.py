@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from palpate.errors import InputDataError
-from palpate.images.distance import DistanceMap, distance_map
+from palpate.images.distance import DistanceMap, distance_map, window_around
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 
@@ -26,16 +25,6 @@ def tissue_distance_map(
         raise InputDataError(f"tissue '{segmentation.tissues[tissue].name}' has no voxel in the image")
     window = window_around(mask, segmentation.grid, reach_mm=reach_mm)
     return distance_map(mask[window], cropped(segmentation.grid, window), smoothing_mm=smoothing_mm, far=far)
-
-
-def window_around(mask: NDArray[np.bool_], grid: VoxelGrid, *, reach_mm: float) -> tuple[slice, slice, slice]:
-    """Index ranges of the voxels within `reach_mm` of the box around `mask` (n_x, n_y, n_z), which is not empty."""
-    found = ndimage.find_objects(mask.astype(np.int8))[0]
-    margin = np.ceil(reach_mm / grid.spacing).astype(int)
-    i, j, k = (
-        slice(max(s.start - m, 0), min(s.stop + m, n)) for s, m, n in zip(found, margin, mask.shape, strict=True)
-    )
-    return (i, j, k)
 
 
 def window_of(index: NDArray[np.float64], grid: VoxelGrid, *, margin: int) -> tuple[slice, slice, slice]:

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from palpate.images.distance import window_around
 from palpate.images.segmentation import Segmentation
 from palpate.images.surface_alignment import shown_tissues
 from palpate.images.tissue import Role
-from palpate.images.tissue_distance import REACH_MM, window_around
+from palpate.images.tissue_distance import REACH_MM
 from palpate.mechanics.solvers.registry import expected_of_size
 from palpate.memory import available_memory, total_memory
 from palpate.mesh import SizeField, TetMesh

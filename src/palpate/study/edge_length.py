@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage
 
+from palpate.images.distance import window_around
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.images.tissue_distance import window_around
 from palpate.mechanics.dilatation import choose_element
 from palpate.mesh.anatomy import Box, domain_box, margin_box
 from palpate.study.case import Case
