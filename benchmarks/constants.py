@@ -27,7 +27,7 @@ from palpate.errors import PalpateError
 from palpate.inversion import invert, posterior_sd
 
 MOST = 0.1  # posterior standard deviations
-SHARES = ("BAD", "GOOD", "FITTED")
+SHARES = ("BAD", "FITTED")
 
 
 def main() -> int:

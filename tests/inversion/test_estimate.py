@@ -171,7 +171,7 @@ def test_a_second_kind_of_observation_is_stated_with_its_fit(twins, twin, with_a
 def iterate(twins, twin, voxels):
     """The end of a loop near the truth, on a reduced basis."""
     start = begun(twins.objective_of(voxels, twin.coefficients), twin.unknowns)
-    end = minimised(start, twins.settings(1.0).bounds, estimate.CHEAP, progress=twins.silent, title="")
+    end = minimised(start, twins.settings(1.0).bounds, estimate.NEAR, progress=twins.silent, title="")
     assert end.minimum.converged
     return end
 
@@ -181,7 +181,7 @@ def worse(twins, iterate, by):
     theta = iterate.minimum.unknowns[:2] + by
     held = Bounds(theta - 1e-3, theta + 1e-3)
     start = begun(iterate.objective, np.concatenate([theta, iterate.minimum.unknowns[2:]]))
-    end = minimised(start, held, estimate.CHEAP, progress=twins.silent, title="")
+    end = minimised(start, held, estimate.NEAR, progress=twins.silent, title="")
     return replace(end, minimum=replace(end.minimum, outcome=estimate.Outcome.CONVERGED))
 
 

@@ -32,10 +32,9 @@ from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, during, silent
 
 REPORTED = StopRule()
-CHEAP = StopRule(step_sd=0.3, floor=0.01)
-COMPARED = replace(CHEAP, correlate=False)  # the numbers of independent residuals stay: objectives are compared
+NEAR = StopRule(step_sd=0.2)  # of a start that is followed further, and of an interval: a tenth of its half-width
+COMPARED = replace(NEAR, correlate=False)  # the numbers of independent residuals stay: objectives are compared
 FOLLOWED = 2  # minima of starts beside the first one, the best
-RELEASED = StopRule(step_sd=0.2)  # an interval, to a tenth of its half-width
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
 
 
@@ -159,7 +158,7 @@ def first_noise_of(
     begin = np.concatenate([middle, np.zeros(problem.parameters.n_coefficients)])
     objective, unknowns, _ = _with_reduced_bases(problem.linear(), settings, begin, progress)
     objective = with_first_noise(objective).rematched(np.zeros(objective.parameters.n_unknowns))
-    nearby = minimised(begun(objective, unknowns), settings.bounds, CHEAP, progress=progress, title="the middle start")
+    nearby = minimised(begun(objective, unknowns), settings.bounds, NEAR, progress=progress, title="the middle start")
     return nearby.objective, nearby.minimum
 
 
@@ -200,7 +199,7 @@ def continue_at_finite_strain(
 
 @blas_on_one_thread()
 def with_released(
-    inversion: Inversion, settings: InversionSettings, *, progress: Progress, rule: StopRule = RELEASED
+    inversion: Inversion, settings: InversionSettings, *, progress: Progress, rule: StopRule = NEAR
 ) -> OuterIterate | None:
     """The best minimum followed on with those blocks free that were held while it was sought (see `Block.released`).
 
@@ -248,7 +247,7 @@ def _linear(
     still, n, bounds = np.zeros(objective.parameters.n_unknowns), objective.n_parameters, settings.bounds
     objective = with_first_noise(objective).rematched(still)
     rest = objective(still)
-    first = minimised(begun(objective, begin), bounds, CHEAP, progress=progress, title="the middle start")
+    first = minimised(begun(objective, begin), bounds, NEAR, progress=progress, title="the middle start")
     screened = _screened(first, settings, progress)
     groups = _groups(screened, n)
     ends, spent = [first], first.minimum.evaluations

@@ -26,7 +26,6 @@ from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns.blocks import Acts, Block
 
-ONE_TERM, OTHER_TERMS = 0.3, 0.05  # amplitudes of one term and of the others; one may hide the other
 LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the block's own kernel: no mode is forbidden
 FITTED = 0.5  # of a kind's residuals, the largest share that is taken for fitted by the unknowns
 
@@ -306,11 +305,7 @@ def _most_evident(
         return -evidence, -2.0 * squares * slopes
 
     limits = np.log(block.amplitudes)
-    starts = np.log(np.where(np.eye(len(terms)) > 0.0, ONE_TERM, OTHER_TERMS)).clip(*limits)
-    found = [
-        optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=[tuple(limits)] * len(terms))
-        for start in starts
-    ]
-    best = min(found, key=lambda trial: float(trial.fun))
+    start = np.zeros(len(terms)).clip(*limits)
+    best = optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=[tuple(limits)] * len(terms))
     squares = np.exp(2.0 * best.x)
     return odds - float(best.fun), sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))

@@ -56,10 +56,27 @@ class Linearisation:
     ) -> Linearisation:
         """That of residuals with a Jacobian (n, n_columns); weights (n,): None, robust ones by the loss."""
         if weights is None:
-            weights = residuals.weights * observation.weighting.loss.weight(residuals.values)
+            weights = _robust_weights(observation, residuals)
         believed = observation.weighting.precision * weights
         score, information = jacobian.transposed_times(believed * residuals.values), jacobian.gram(believed)
         return cls(observation, state, residuals, columns, jacobian, weights, score, information)
+
+    def moved(self, observation: Observation, step: NDArray[np.float64]) -> Linearisation:
+        """That of the residuals r + J d after a step d (n_unknowns,), as an observation otherwise weighted has them.
+
+        The weights of most residuals stay: their part of the information is not formed again.
+        """
+        values = self.residuals.values + self.jacobian.times(step[self.columns])
+        residuals = observation.weighed(replace(self.residuals, values=values))
+        weights, precision = _robust_weights(observation, residuals), observation.weighting.precision
+        change = precision * (weights - self.weights)
+        if np.count_nonzero(change) > self.jacobian.by_displacement.shape[1]:  # the whole costs less
+            return Linearisation.of(observation, self.state, residuals, self.columns, self.jacobian, weights)
+        information = self.jacobian.regram(precision / self.precision * self.information, change)
+        score = self.jacobian.transposed_times(precision * weights * values)
+        return replace(
+            self, observation=observation, residuals=residuals, weights=weights, score=score, information=information
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,14 +332,8 @@ class LinearisedObjective:
         """J at `unknowns` (n_unknowns,) with the residuals r + J (x - x_0) by the Jacobians."""
         step = unknowns - self.unknowns
 
-        def line(of: tuple[Observation, Linearisation]) -> Linearisation:
-            """One observation's residuals with their derivative."""
-            observation, known = of
-            values = known.residuals.values + known.jacobian.times(step[known.columns])
-            residuals = observation.weighed(replace(known.residuals, values=values))
-            return Linearisation.of(observation, known.state, residuals, known.columns, known.jacobian)
-
-        lines = mapped(line, zip(self.objective.observations, self.evaluation.linearisations, strict=True))
+        pairs = zip(self.objective.observations, self.evaluation.linearisations, strict=True)
+        lines = mapped(lambda pair: pair[1].moved(pair[0], step), pairs)
         found = self.objective.assembled(unknowns, lines)
         if not self.damping:
             return found
@@ -341,6 +352,11 @@ def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np
     """
     unit = np.eye(len(evaluation.matrix))[:, :n_parameters]
     return np.concatenate([unit, evaluation.covariance_columns(n_parameters)], axis=1)
+
+
+def _robust_weights(observation: Observation, residuals: Residuals) -> NDArray[np.float64]:
+    """The weights (n,) of residuals, times what the loss leaves of each."""
+    return np.asarray(residuals.weights * observation.weighting.loss.weight(residuals.values))
 
 
 def worse_driver(sd: float, kind_sd: float) -> float:

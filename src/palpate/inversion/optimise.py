@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from palpate.errors import SolverError
 from palpate.inversion.objective import Evaluation
 
-AT_BOUND = 1e-6  # of ln E
 RADIUS = 2.0  # of the log-moduli, the largest of a step; a first one has half of it
-LEAST_DAMPING = 0.1  # of the diagonal: less is nearly the step that was refused
-BAD, GOOD = 0.25, 0.75  # shares of the reduction that is promised (Nocedal & Wright 2006, Algorithm 4.1)
+BAD = 0.25  # share of the reduction that is promised, good from 1 - 0.25 on (Nocedal & Wright 2006, Algorithm 4.1)
 TRIALS = 12  # of a step
 SAME_MINIMUM = 0.02  # of ln E: minima no further apart are one
 
@@ -59,7 +57,7 @@ class Bounds:
 
     def reached(self, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which of theta (n_parameters,) lie at a bound: what holds them there is the search, not the images."""
-        return np.asarray(np.minimum(theta - self.lower, self.upper - theta) < AT_BOUND)
+        return np.asarray((theta <= self.lower) | (theta >= self.upper))
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,15 +98,15 @@ class TrustRegion:
 
         It is damped only where no log-modulus is left to be shortened: damping all unknowns ends a step along a valley.
         """
-        damping = self.damping if longest > SAME_MINIMUM else max(4.0 * self.damping, LEAST_DAMPING)
+        damping = self.damping if longest > SAME_MINIMUM else max(4.0 * self.damping, 1.0)
         return TrustRegion(0.5 * min(self.radius, longest), damping)
 
     def after(self, share: float, longest: float, *, grows: bool = True) -> TrustRegion:
         """After a step that was taken, which brought a `share` of what it promised."""
-        damping = self.damping / 4.0 if self.damping > LEAST_DAMPING else 0.0
+        damping = self.damping / 4.0 if self.damping > 1.0 else 0.0
         if share < BAD:
             return TrustRegion(0.5 * min(self.radius, longest), damping)
-        return TrustRegion(min(2.0 * self.radius, RADIUS) if share > GOOD and grows else self.radius, damping)
+        return TrustRegion(min(2.0 * self.radius, RADIUS) if share > 1.0 - BAD and grows else self.radius, damping)
 
 
 WHOLE = TrustRegion(np.inf, 0.0)  # the step to the minimum of the quadratic model

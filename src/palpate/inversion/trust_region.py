@@ -254,12 +254,12 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     settled = not cut and bool(np.all(np.abs(found.unknowns - at.unknowns)[:n] < posterior_sd(found, n)))
     if rule.correlate and settled and start.correlated < SETTLES:
         objective = with_correlations(objective, found.evaluation)
-        plain = LinearisedObjective(objective, at.unknowns, at.evaluation)
-        found = replace(found, evaluation=plain(found.unknowns))
+        found = replace(found, evaluation=replace(linear, objective=objective)(found.unknowns))
+        plain = LinearisedObjective(objective, found.unknowns, found.evaluation)
         now, total = objective.total(plain(at.unknowns)), objective.total(found.evaluation)
     for _ in range(rule.iterations):
         learned = with_hyper_parameters(objective, found.evaluation, found.unknowns)
-        linear = LinearisedObjective(learned, at.unknowns, at.evaluation)
+        linear = LinearisedObjective(learned, found.unknowns, found.evaluation)
         again = gauss_newton(linear, found.unknowns, bounds=near, fixed=fixed, tolerance=INNER, within=within)
         lower = learned.total(again.evaluation)
         if lower > total:
@@ -268,7 +268,7 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
         change, objective, found, total = total - lower, learned, again, lower
         if np.all(moved < 0.1) and change < INNER:
             break
-    begin = LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns)
+    begin = LinearisedObjective(objective, found.unknowns, found.evaluation)(at.unknowns)
     return _Step(objective, found, begin, now, total, cut, settled)
 
 
