@@ -59,7 +59,7 @@ class Jacobian:
         """J^T (W + diag(change)) J (n_columns, n_columns) from the gram J^T W J; change (n,) of weights, few not 0."""
         rows = np.flatnonzero(change)
         formed = np.asarray(self.by_displacement[rows] @ self.tangent)
-        return gram + formed.T @ (change[rows, None] * formed)
+        return np.asarray(gram + formed.T @ (change[rows, None] * formed))
 
     def summed(self, rows: sparse.csr_matrix[np.float64]) -> NDArray[np.float64]:
         """A J (m, n_columns) for sparse sums A (m, n) of residuals."""

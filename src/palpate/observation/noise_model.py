@@ -70,11 +70,11 @@ class NoiseModel:
             """That of one variance and its length."""
             variance, length = of
             centres, carried = _carried(rows, places, normals, 0.5 * length)
-            tree = cKDTree(centres)
-            pairs = tree.sparse_distance_matrix(tree, 3.5 * length, output_type="coo_matrix").tocsr()
-            pairs.data = _gaussian(pairs.data, length)
-            pairs.setdiag(1.0)
-            return variance * sum((part @ _times(pairs, part.T) for part in carried), np.zeros((len(rows),) * 2))
+            i, j = cKDTree(centres).query_pairs(3.5 * length, output_type="ndarray").T
+            apart = np.linalg.norm(centres[i] - centres[j], axis=1)
+            once = sparse.csr_matrix((_gaussian(apart, length), (i, j)), shape=(len(centres),) * 2)
+            across = sum((part @ _times(once, part.T) for part in carried), np.zeros((len(rows),) * 2))
+            return variance * (across + across.T + sum((part @ part.T for part in carried), np.zeros(across.shape)))
 
         return np.asarray(np.sum(mapped(term, zip(self.variances, self.lengths, strict=True)), axis=0))
 
