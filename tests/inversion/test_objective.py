@@ -132,6 +132,7 @@ def test_a_linearised_objective_counts_by_the_weights_of_its_own_objective(objec
     linearised = LinearisedObjective(other, unknowns, now)
     assert linearised(unknowns).value == pytest.approx(other(unknowns).value, rel=1e-12)
     assert linearised(unknowns).score == pytest.approx(other(unknowns).score, rel=1e-12)
+    assert linearised(unknowns).matrix == pytest.approx(other(unknowns).matrix, rel=1e-10, abs=1e-9)
 
 
 def test_the_modes_of_one_image_do_not_move_the_other(twins, twin):

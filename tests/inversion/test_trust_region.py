@@ -60,10 +60,12 @@ def test_the_way_to_the_estimate_does_not_show(twins, voxels, found, ratio):
     assert scales[0] == pytest.approx(scales[1], rel=5e-3)
 
 
-def test_no_accepted_step_raises_the_objective(twins, voxels):
+def test_no_accepted_step_raises_the_objective(twins, twin, voxels):
     """But for the noise of closest points; most steps lower it."""
+    objective = with_first_noise(twins.objective_of(voxels, twin.coefficients))
     for ratio in (0.2, 30.0):
-        end = end_of(invert(voxels, twins.settings(ratio), progress=twins.silent))
+        start = begun(objective, np.concatenate([np.log([ratio, ratio]), twin.coefficients]))
+        end = minimised(start, twins.settings(ratio).bounds, StopRule(), progress=twins.silent, title="")
         steps = np.array(end.totals)
         assert len(steps) > 1
         assert np.all(steps[:, 1] < steps[:, 0] + trust_region.NOISE)

@@ -154,6 +154,22 @@ class _Seen:
         slopes = [0.5 * float(left @ term @ left - np.sum(term * response)) for term in terms]
         return 0.5 * float(self.pull @ x) - 0.5 * determinant, np.array(slopes)
 
+    def log_evidence_of_one(self, term: NDArray[np.float64]) -> Callable[[float], float]:
+        """The same of a single term C_1 = L L^T as a function of v: 1/2 sum_i (v c_i^2 / (1 + v l_i) - ln(1 + v l_i)).
+
+        l_i, V: eigenvalues and vectors of L^T A L; c = V^T L^T b.
+        """
+        root = linalg.cholesky(term, lower=True, check_finite=False)
+        sizes, axes = linalg.eigh(root.T @ self.information @ root, check_finite=False)
+        sizes, along = np.maximum(sizes, 0.0), (axes.T @ (root.T @ self.pull)) ** 2
+
+        def evidence(variance: float) -> float:
+            """F at a variance."""
+            grown = 1.0 + variance * sizes
+            return 0.5 * float(np.sum(variance * along / grown - np.log(grown)))
+
+        return evidence
+
 
 def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
     """The objective with the blocks' alternatives and amplitudes of the largest evidence, block after block.
@@ -297,6 +313,17 @@ def _most_evident(
 ) -> tuple[float, NDArray[np.float64]]:
     """The largest log-evidence, with its log prior odds, of a family of priors of a block; its covariance (n, n)."""
     floored = [term + LEAST_VARIANCE * np.eye(len(term)) for term in terms]
+    limits = np.log(block.amplitudes)
+    if len(floored) == 1:
+        evidence = seen.log_evidence_of_one(floored[0])
+        ends, log = [evidence(float(np.exp(2.0 * end))) for end in limits], float(limits[0])
+        if limits[0] < limits[1]:
+            inner = optimize.minimize_scalar(
+                lambda log: -evidence(float(np.exp(2.0 * log))), bounds=tuple(limits), method="bounded"
+            )
+            ends.append(-float(inner.fun))
+            log = (*limits.tolist(), float(inner.x))[int(np.argmax(ends))]
+        return odds + max(ends), np.exp(2.0 * log) * floored[0]
 
     def worse(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """Minus the log-evidence at ln of the amplitudes (n_terms,), with its derivative."""
@@ -304,7 +331,6 @@ def _most_evident(
         evidence, slopes = seen.log_evidence(floored, squares)
         return -evidence, -2.0 * squares * slopes
 
-    limits = np.log(block.amplitudes)
     start = np.zeros(len(terms)).clip(*limits)
     best = optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=[tuple(limits)] * len(terms))
     squares = np.exp(2.0 * best.x)

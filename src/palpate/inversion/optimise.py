@@ -13,6 +13,7 @@ from palpate.errors import SolverError
 from palpate.inversion.objective import Evaluation
 
 RADIUS = 2.0  # of the log-moduli, the largest of a step; a first one has half of it
+LEAST_DAMPING = 0.1  # of the diagonal: less is nearly the step that was refused
 BAD = 0.25  # share of the reduction that is promised, good from 1 - 0.25 on (Nocedal & Wright 2006, Algorithm 4.1)
 TRIALS = 12  # of a step
 SAME_MINIMUM = 0.02  # of ln E: minima no further apart are one
@@ -98,12 +99,12 @@ class TrustRegion:
 
         It is damped only where no log-modulus is left to be shortened: damping all unknowns ends a step along a valley.
         """
-        damping = self.damping if longest > SAME_MINIMUM else max(4.0 * self.damping, 1.0)
+        damping = self.damping if longest > SAME_MINIMUM else max(4.0 * self.damping, LEAST_DAMPING)
         return TrustRegion(0.5 * min(self.radius, longest), damping)
 
     def after(self, share: float, longest: float, *, grows: bool = True) -> TrustRegion:
         """After a step that was taken, which brought a `share` of what it promised."""
-        damping = self.damping / 4.0 if self.damping > 1.0 else 0.0
+        damping = self.damping / 4.0 if self.damping > LEAST_DAMPING else 0.0
         if share < BAD:
             return TrustRegion(0.5 * min(self.radius, longest), damping)
         return TrustRegion(min(2.0 * self.radius, RADIUS) if share > 1.0 - BAD and grows else self.radius, damping)
