@@ -16,8 +16,8 @@ import json
 import os
 import pkgutil
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -125,7 +125,7 @@ def _elsewhere(case: Posed, *, shift: float) -> Iterator[Posed]:
     yield replace(case, settings=replace(case.settings, starts=starts))
 
 
-CONDITIONS = {
+CONDITIONS: dict[str, Callable[[Posed], AbstractContextManager[Posed]]] = {
     "another number of processors": _one_processor,
     "little memory": _little_memory,
     "starts e times as stiff": partial(_elsewhere, shift=1.0),

@@ -48,6 +48,8 @@ from palpate.parallel import blas_on_one_thread
 from palpate.phantoms import PelvisOptions, Scene, pelvis, pelvis_anatomy
 from palpate.study import (
     Case,
+    Discrepancy,
+    Domain,
     Mechanics,
     MeshSettings,
     Phantom,
@@ -143,11 +145,14 @@ class Posed:
         return 3 * len(self.problem.states[0].model.space.points)
 
 
-def problem_of(edge_mm: float, seed: int, law: str = "linear") -> Posed:
-    """What a simulated pelvis poses at an edge length."""
+def problem_of(edge_mm: float, seed: int, law: str = "linear", *, held: bool = False) -> Posed:
+    """What a simulated pelvis poses at an edge length; held: with moduli and the wall's motion alone as unknowns."""
     scene = _scene(seed, law)
     mechanics = Mechanics(law, "P2" if law == "linear" else "auto")
     case = Case(f"speed-{seed}", phantom=Phantom("pelvis", seed), mesh=MeshSettings(edge_mm), mechanics=mechanics)
+    if held:
+        nothing = Discrepancy(heterogeneity_sd=0.0, poisson_sd=0.0, surface_offset_mm=0.0, layer_sd=0.0)
+        case = replace(case, domain=Domain(outer_boundary="fixed"), discrepancy=nothing)
     before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
     body = make_body(aligned(before, (after,), method="none"), case, progress=_silent)
     problem = inverse_problem(body, case, progress=_silent)
@@ -236,16 +241,17 @@ def _nonlinear(sizes: Sizes, seed: int, say: Say) -> Result:
 
 
 def _gradient(sizes: Sizes, seed: int, say: Say) -> Result:
-    posed = problem_of(sizes.gradient, seed)
+    posed = problem_of(sizes.gradient, seed, held=True)
     problem, model, mapping = posed.problem, posed.problem.states[0].model, posed.problem.parameters
     say(f"{posed.n_dofs} unknowns")
     middle = mapping.moduli(np.median(np.stack(posed.settings.starts), axis=0))
-    coefficients = 0.3 * np.random.default_rng(seed).standard_normal(model.n_modes)
+    theta = np.log(posed.moduli[mapping.selection.argmax(axis=0)] / mapping.scale_kpa)
+    rng = np.random.default_rng(seed)
+    unknowns = np.concatenate([theta, 0.3 * rng.standard_normal(mapping.n_unknowns - mapping.n_parameters)])
+    (coefficients,) = mapping.coefficients(unknowns)
     began = time.perf_counter()
     basis = reduced_basis(model, middle).with_modulus_series(coefficients, mapping.selection)
     offline_s = time.perf_counter() - began
-    theta = np.log(posed.moduli[mapping.selection.argmax(axis=0)] / mapping.scale_kpa)
-    unknowns = np.concatenate([theta, coefficients])
     objective = Objective(problem.states, mapping).under([basis])
     objective = objective.with_observations([o.with_noise(SEGMENTATION_NOISE) for o in objective.observations])
     objective = objective.rematched(unknowns)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from palpate.errors import ConfigurationError
 from palpate.mechanics.boundary import outer_constraint
@@ -52,6 +53,19 @@ def test_the_displacement_is_the_superposition_of_the_unit_responses(model, rng)
     responses = model.responses(MODULI)
     expected = model.solve(MODULI, coefficients).values
     assert np.allclose(responses @ np.append(coefficients, 1.0), expected, atol=1e-12 * abs(expected).max())
+
+
+def test_systems_at_all_moduli_have_one_pattern(model):
+    """Also where parts of an entry cancel: the solver's plan is of the pattern."""
+    first, second, *others = model.free_stiffness
+    n = first.shape[0]
+    pair = ([1.0, 1.0], ([0, n - 1], [n - 1, 0]))
+    apart = sparse.csr_matrix(pair, shape=(n, n))
+    cancelling = replace(model, free_stiffness=(first + 1e-3 * apart, second - 1e-3 * apart, *others))
+    patterns = [cancelling.system(np.full(model.n_regions, e)).factorisation.matrix for e in (1.0, 2.0)]
+    patterns.append(cancelling.system(np.linspace(1.0, 2.0, model.n_regions)).factorisation.matrix)
+    assert all(np.array_equal(p.indices, patterns[0].indices) for p in patterns)
+    assert patterns[0][0, n - 1] == 0.0
 
 
 def test_what_is_prescribed_is_met_exactly(model, rng):

@@ -108,7 +108,9 @@ class LinearModel:
         """The factorised system at moduli (n_regions,) kPa, for any number of solves; raises `SolverError`."""
         checked = checked_moduli(moduli, self.names)
         near_nullspace = self.constraint.free.T @ rigid_modes(self.space.points)
-        matrix = weighted_sum(checked, self.free_stiffness)
+        # SciPy drops what cancels in a sum: with an imaginary part it stays, and one plan serves all moduli
+        marked = (sparse.csr_matrix((k.data + 1j, k.indices, k.indptr), shape=k.shape) for k in self.free_stiffness)
+        matrix = sparse.csr_matrix(weighted_sum(checked, tuple(marked)).real)
         return LinearSystem(
             self,
             checked,
