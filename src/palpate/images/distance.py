@@ -109,21 +109,19 @@ def distance_map(mask: NDArray[np.bool_], grid: VoxelGrid, *, smoothing_mm: floa
     plane; far from it the Euclidean distance transform, blended over one sigma. `smoothing_mm` is sigma, mm. Without
     `far` the map ends in planes of 2.5 sigma, for what is asked near the surface: a third of the price.
     """
-    limit = PROBIT_LIMIT * smoothing_mm
-    if not far:
-        values = np.full(mask.shape, limit)
-    elif not mask.any() or mask.all():
-        size = float(np.linalg.norm(grid.spacing * grid.shape))
-        values = np.full(mask.shape, -size if mask.all() else size)
-    else:  # between voxel centres, less half a voxel so that it is zero on the faces between them
-        half = 0.5 * float(grid.spacing.mean())
-        values = ndimage.distance_transform_edt(~mask, sampling=grid.spacing) - half
-        inside = window_around(mask, grid, reach_mm=float(grid.spacing.min()))
-        depth = ndimage.distance_transform_edt(mask[inside], sampling=grid.spacing)
-        values[inside] = np.where(mask[inside], half - depth, values[inside])
+    limit, size = PROBIT_LIMIT * smoothing_mm, float(np.linalg.norm(grid.spacing * grid.shape))
+    values = np.full(mask.shape, size if far else limit)
     if mask.any():  # the smoothed indicator is none but around the mask
         box = window_around(mask, grid, reach_mm=TRUNCATED * smoothing_mm + float(grid.spacing.max()))
-        indicator, sigma = mask[box].astype(np.float64), smoothing_mm / grid.spacing
+        within = mask[box]
+        if far and mask.all():
+            values = -values
+        elif far:  # between voxel centres, less half a voxel so that it is zero on the faces between them
+            half = 0.5 * float(grid.spacing.mean())
+            values = ndimage.distance_transform_edt(~mask, sampling=grid.spacing) - half
+            depth = ndimage.distance_transform_edt(within, sampling=grid.spacing)
+            values[box] = np.where(within, half - depth, values[box])
+        indicator, sigma = within.astype(np.float64), smoothing_mm / grid.spacing
         share = ndimage.gaussian_filter(indicator, sigma, mode="nearest", truncate=TRUNCATED)
         near = -smoothing_mm * special.ndtri(np.clip(share, 1e-12, 1.0 - 1e-12))
         weight = np.clip(np.abs(near) / smoothing_mm - (PROBIT_LIMIT - 1.0), 0.0, 1.0)
