@@ -30,7 +30,6 @@ from accuracy_rows import ROWS, Posed, posed
 import palpate.inversion
 from palpate.errors import PalpateError
 from palpate.inversion import invert, posterior_sd
-from palpate.mechanics.solvers import registry
 
 MOST, MOST_BY_CONDITION = 0.1, 0.01  # posterior standard deviations
 LITTLE = 5e7  # bytes of memory
@@ -115,7 +114,7 @@ def _one_processor(case: Posed) -> Iterator[Posed]:
 
 @contextmanager
 def _little_memory(case: Posed) -> Iterator[Posed]:
-    with patch.object(registry, "available_memory", lambda: LITTLE):
+    with patch("palpate.mechanics.solvers.registry.available_memory", lambda: LITTLE):
         yield case
 
 
