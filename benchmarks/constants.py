@@ -4,9 +4,9 @@
 
 Simulated data: rows of accuracy.py. An estimate is made with each number that stands in capitals in `palpate.inversion`
 half and twice as large (shares of a whole at most the mean of themselves and 1); the table says how far the log-moduli
-move, in their posterior standard deviations. So it does for an estimate on one processor, for one with so little memory
-that no factor fits, and for two that begin at moduli e times as large and as small. The exit code is 1 where a constant
-moves one by more than 0.1, or one of these by more than 0.01.
+move, in their posterior standard deviations. So it does for an estimate on another number of processors, for one with
+the solver that is chosen where no factor fits into memory, and for two that begin at moduli e times as large and as
+small. The exit code is 1 where a constant moves one by more than 0.1, or one of these by more than 0.01.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ import json
 import os
 import pkgutil
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from types import ModuleType
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -32,104 +33,108 @@ from palpate.errors import PalpateError
 from palpate.inversion import invert, posterior_sd
 
 MOST, MOST_BY_CONDITION = 0.1, 0.01  # posterior standard deviations
-LITTLE = 5e7  # bytes of memory
 SHARES = ("BAD", "FITTED")
 
 
+Context = Callable[[Posed], AbstractContextManager[Posed]]
+
+
+@dataclass(frozen=True)
+class Change:
+    """What is changed, in which `context` a case is estimated, and by how much that may move it (posterior sd)."""
+
+    name: str
+    words: str
+    most: float
+    context: Context
+
+
 def main() -> int:
-    """Estimate with each constant changed and print by how much the answer moves."""
+    """Estimate under each change and print by how much the answer moves."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rows", default="clean")
-    parser.add_argument("--only", help="constants instead of all")
+    parser.add_argument("--only", help="some of the changes instead of all")
     parser.add_argument("--seed", type=int, default=101)
     parser.add_argument("--edge", type=float, help="edge length (mm) instead of the row's own")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     arguments = parser.parse_args()
-    found, numbers = [], constants()
-    conditions = dict(CONDITIONS)
-    if arguments.only:
-        asked = arguments.only.split(",")
-        numbers = {name: of for name, of in numbers.items() if name in asked}
-        conditions = {name: of for name, of in conditions.items() if name in asked}
+    found, every = [], [*CONDITIONS, *constants()]
+    names = dict.fromkeys(change.name for change in every)
+    asked = arguments.only.split(",") if arguments.only else list(names)
+    if unknown := [name for name in asked if name not in names]:
+        parser.error(f"--only {', '.join(unknown)}: it must name some of {', '.join(names)}")
     for name in arguments.rows.split(","):
         row = ROWS[name] if arguments.edge is None else replace(ROWS[name], edge_mm=arguments.edge)
         case = posed(row, arguments.seed, 0, {})
         theta, sd = _answer(case)
-        for key, condition in conditions.items():
-            with condition(case) as there:
-                moved = (np.abs(_answer(there)[0] - theta) / sd).tolist()
-            found.append({"row": name, "condition": key, "moved_sd": moved})
-            print(_said(found[-1]), file=sys.stderr, flush=True)
-        for key, (value, modules) in numbers.items():
-            for other in _changed(key, value):
-                line = {"row": name, "constant": key, "value": value, "changed": other}
-                try:
-                    with _with(key, other, modules):
-                        line["moved_sd"] = (np.abs(_answer(case)[0] - theta) / sd).tolist()
-                except PalpateError as error:
-                    line["failed"] = str(error)
-                found.append(line)
-                print(_said(line), file=sys.stderr, flush=True)
-    print(json.dumps({"constants": found}, indent=1) if arguments.json else "\n".join([*HEAD, *map(_said, found)]))
-    limits = [MOST_BY_CONDITION if "condition" in line else MOST for line in found]
-    return (
-        0 if all(max(line.get("moved_sd", [np.inf])) <= most for line, most in zip(found, limits, strict=True)) else 1
-    )
+        for change in every:
+            if change.name not in asked:
+                continue
+            line = {"row": name, "changed": change.name, "to": change.words, "most_sd": change.most}
+            try:
+                with change.context(case) as there:
+                    line["moved_sd"] = (np.abs(_answer(there)[0] - theta) / sd).tolist()
+            except PalpateError as error:
+                line["failed"] = str(error)
+            found.append(line)
+            print(_said(line), file=sys.stderr, flush=True)
+    print(json.dumps({"changes": found}, indent=1) if arguments.json else "\n".join([*HEAD, *map(_said, found)]))
+    return 0 if all(max(line.get("moved_sd", [np.inf])) <= line["most_sd"] for line in found) else 1
 
 
-def constants() -> dict[str, tuple[float, tuple[ModuleType, ...]]]:
-    """Every number in capitals of `palpate.inversion`, by its name, and the modules that know it by it."""
+def constants() -> Iterator[Change]:
+    """Every number in capitals of `palpate.inversion`, half and twice as large, in all modules that know its name."""
     modules = [import_module(m.name) for m in pkgutil.iter_modules(palpate.inversion.__path__, "palpate.inversion.")]
     names = {n: v for m in modules for n, v in vars(m).items() if n.isupper() and isinstance(v, int | float)}
-    return {n: (v, tuple(m for m in modules if vars(m).get(n) == v)) for n, v in sorted(names.items())}
+    for name, value in sorted(names.items()):
+        known = [module for module in modules if vars(module).get(name) == value]
+        for other in _changed(name, value):
+            yield Change(name, f"{value:g} -> {other:g}", MOST, partial(_with, known, name, other))
 
 
-def _changed(key: str, value: float) -> tuple[float, float]:
-    half, double = 0.5 * value, min(2.0 * value, 0.5 * (1.0 + value)) if key in SHARES else 2.0 * value
+def _changed(name: str, value: float) -> tuple[float, float]:
+    half, double = 0.5 * value, min(2.0 * value, 0.5 * (1.0 + value)) if name in SHARES else 2.0 * value
     return (max(round(half), 1), round(double)) if isinstance(value, int) else (half, double)
 
 
 @contextmanager
-def _with(key: str, value: float, modules: tuple[ModuleType, ...]) -> Iterator[None]:
-    before = [getattr(module, key) for module in modules]
-    try:
+def _with(modules: Sequence[ModuleType], name: str, value: object, case: Posed) -> Iterator[Posed]:
+    """The case while a name of some modules means something else."""
+    with ExitStack() as changed:
         for module in modules:
-            setattr(module, key, value)
-        yield
-    finally:
-        for module, old in zip(modules, before, strict=True):
-            setattr(module, key, old)
-
-
-@contextmanager
-def _one_processor(case: Posed) -> Iterator[Posed]:
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = "1" if before != "1" else str(os.cpu_count())
-    try:
-        yield case
-    finally:
-        del os.environ["OMP_NUM_THREADS"]
-        os.environ |= {} if before is None else {"OMP_NUM_THREADS": before}
-
-
-@contextmanager
-def _little_memory(case: Posed) -> Iterator[Posed]:
-    with patch("palpate.mechanics.solvers.registry.available_memory", lambda: LITTLE):
+            changed.enter_context(patch.object(module, name, value))
         yield case
 
 
 @contextmanager
-def _elsewhere(case: Posed, *, shift: float) -> Iterator[Posed]:
+def _processors(case: Posed) -> Iterator[Posed]:
+    """The case on one processor; on all where the environment leaves one already."""
+    other = str(os.cpu_count()) if os.environ.get("OMP_NUM_THREADS") == "1" else "1"
+    with patch.dict(os.environ, OMP_NUM_THREADS=other):
+        yield case
+
+
+@contextmanager
+def _memory(case: Posed) -> Iterator[Posed]:
+    """The case with the solver that is chosen where no factor fits into the memory that is free."""
+    models = [replace(state.model, solver="multigrid") for state in case.problem.states]
+    states = tuple(replace(state, model=model) for state, model in zip(case.problem.states, models, strict=True))
+    yield replace(case, problem=replace(case.problem, states=states))
+
+
+@contextmanager
+def _starts(shift: float, case: Posed) -> Iterator[Posed]:
+    """The case with all log-moduli of the starts shifted."""
     starts = tuple(start + shift for start in case.settings.starts)
     yield replace(case, settings=replace(case.settings, starts=starts))
 
 
-CONDITIONS: dict[str, Callable[[Posed], AbstractContextManager[Posed]]] = {
-    "another number of processors": _one_processor,
-    "little memory": _little_memory,
-    "starts e times as stiff": partial(_elsewhere, shift=1.0),
-    "starts e times as soft": partial(_elsewhere, shift=-1.0),
-}
+CONDITIONS = (
+    Change("processors", "others", MOST_BY_CONDITION, _processors),
+    Change("memory", "too little for a factor", MOST_BY_CONDITION, _memory),
+    Change("starts", "e times as stiff", MOST_BY_CONDITION, partial(_starts, 1.0)),
+    Change("starts", "e times as soft", MOST_BY_CONDITION, partial(_starts, -1.0)),
+)
 
 
 def _answer(case: Posed) -> tuple[np.ndarray, np.ndarray]:
@@ -139,15 +144,13 @@ def _answer(case: Posed) -> tuple[np.ndarray, np.ndarray]:
     return found.minimum.unknowns[:n], posterior_sd(found.minimum, n)
 
 
-HEAD = ("| row | constant | is | becomes | log-moduli move, sd |", "|---|---|---|---|---|")
+HEAD = ("| row | changed | to | log-moduli move, sd |", "|---|---|---|---|")
 
 
-def _said(line: dict[str, object]) -> str:
+def _said(line: Mapping[str, Any]) -> str:
     moved = line.get("moved_sd")
-    told = ", ".join(f"{of:.3f}" for of in moved) if isinstance(moved, list) else line["failed"]
-    if "condition" in line:
-        return f"| `{line['row']}` | {line['condition']} | | | {told} |"
-    return f"| `{line['row']}` | `{line['constant']}` | {line['value']:g} | {line['changed']:g} | {told} |"
+    told = ", ".join(f"{of:.3f}" for of in moved) if moved else line["failed"]
+    return f"| `{line['row']}` | `{line['changed']}` | {line['to']} | {told} |"
 
 
 if __name__ == "__main__":

@@ -245,13 +245,12 @@ def _gradient(sizes: Sizes, seed: int, say: Say) -> Result:
     problem, model, mapping = posed.problem, posed.problem.states[0].model, posed.problem.parameters
     say(f"{posed.n_dofs} unknowns")
     middle = mapping.moduli(np.median(np.stack(posed.settings.starts), axis=0))
-    theta = np.log(posed.moduli[mapping.selection.argmax(axis=0)] / mapping.scale_kpa)
-    rng = np.random.default_rng(seed)
-    unknowns = np.concatenate([theta, 0.3 * rng.standard_normal(mapping.n_unknowns - mapping.n_parameters)])
-    (coefficients,) = mapping.coefficients(unknowns)
+    coefficients = 0.3 * np.random.default_rng(seed).standard_normal(model.n_modes)
     began = time.perf_counter()
     basis = reduced_basis(model, middle).with_modulus_series(coefficients, mapping.selection)
     offline_s = time.perf_counter() - began
+    theta = np.log(posed.moduli[mapping.selection.argmax(axis=0)] / mapping.scale_kpa)
+    unknowns = np.concatenate([theta, coefficients])
     objective = Objective(problem.states, mapping).under([basis])
     objective = objective.with_observations([o.with_noise(SEGMENTATION_NOISE) for o in objective.observations])
     objective = objective.rematched(unknowns)

@@ -101,7 +101,7 @@ def test_the_score_of_the_objective_has_that_by_poissons_ratio(twin, point_motio
     h = 1e-4
     slope = (objective.value(x + h * step) - objective.value(x - h * step)) / (2.0 * h)
     assert objective(x).score @ step == pytest.approx(slope, rel=1e-5)
-    assert abs(objective(x).score[2]) > 1.0
+    assert abs(objective(x).score[2]) > max(1.0, 0.01 * abs(slope))
 
 
 def test_the_reduced_basis_keeps_its_bound_over_poissons_ratio(twin):

@@ -61,7 +61,7 @@ def test_the_way_to_the_estimate_does_not_show(twins, voxels, found, ratio):
 
 
 def test_no_accepted_step_raises_the_objective(twins, twin, voxels):
-    """But for the noise of closest points; most steps lower it."""
+    """But for the noise of closest points; all of them together lower it."""
     objective = with_first_noise(twins.objective_of(voxels, twin.coefficients))
     for ratio in (0.2, 30.0):
         start = begun(objective, np.concatenate([np.log([ratio, ratio]), twin.coefficients]))
@@ -69,6 +69,7 @@ def test_no_accepted_step_raises_the_objective(twins, twin, voxels):
         steps = np.array(end.totals)
         assert len(steps) > 1
         assert np.all(steps[:, 1] < steps[:, 0] + trust_region.NOISE)
+        assert np.sum(steps[:, 1] - steps[:, 0]) < -trust_region.NOISE
 
 
 def test_where_it_ends_the_objective_is_least_along_every_log_modulus(found):

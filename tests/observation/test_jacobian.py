@@ -28,7 +28,7 @@ def test_it_is_the_product_of_its_factors(whole, rng):
     assert jacobian.transposed_times(y) == pytest.approx(dense.T @ y)
     assert jacobian.gram(weights) == pytest.approx(dense.T @ (weights[:, None] * dense))
     change = np.where(np.arange(50) % 9 == 0, rng.standard_normal(50), 0.0)
-    assert jacobian.regram(jacobian.gram(weights), change) == pytest.approx(
+    assert jacobian.changed_gram(jacobian.gram(weights), change) == pytest.approx(
         dense.T @ ((weights + change)[:, None] * dense)
     )
     assert jacobian.summed(sums) == pytest.approx(sums @ dense)

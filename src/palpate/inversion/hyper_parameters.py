@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,9 @@ from palpate.unknowns.blocks import Acts, Block
 
 LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the block's own kernel: no mode is forbidden
 FITTED = 0.5  # of a kind's residuals, the largest share that is taken for fitted by the unknowns
+
+LogEvidence = Callable[[NDArray[np.float64]], tuple[float, NDArray[np.float64]]]
+"""A log-evidence F and dF / d v_t (n_terms,) at the variances v_t (n_terms,) of a prior's terms."""
 
 
 def with_first_noise(objective: Objective) -> Objective:
@@ -154,19 +158,20 @@ class _Seen:
         slopes = [0.5 * float(left @ term @ left - np.sum(term * response)) for term in terms]
         return 0.5 * float(self.pull @ x) - 0.5 * determinant, np.array(slopes)
 
-    def log_evidence_of_one(self, term: NDArray[np.float64]) -> Callable[[float], float]:
-        """The same of a single term C_1 = L L^T as a function of v: 1/2 sum_i (v c_i^2 / (1 + v l_i) - ln(1 + v l_i)).
+    def of_one_term(self, term: NDArray[np.float64]) -> LogEvidence:
+        """The same of one term C_1 = L L^T: F = 1/2 sum_i (v c_i^2 / (1 + v l_i) - ln(1 + v l_i)).
 
-        l_i, V: eigenvalues and vectors of L^T A L; c = V^T L^T b.
+        l_i, V: eigenvalues and vectors of L^T A L, once for all variances v; c = V^T L^T b.
         """
         root = linalg.cholesky(term, lower=True, check_finite=False)
         sizes, axes = linalg.eigh(root.T @ self.information @ root, check_finite=False)
-        sizes, along = np.maximum(sizes, 0.0), (axes.T @ (root.T @ self.pull)) ** 2
+        sizes, squares = np.maximum(sizes, 0.0), (axes.T @ (root.T @ self.pull)) ** 2
 
-        def evidence(variance: float) -> float:
-            """F at a variance."""
-            grown = 1.0 + variance * sizes
-            return 0.5 * float(np.sum(variance * along / grown - np.log(grown)))
+        def evidence(variances: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+            """F and dF / dv (1,) at a variance (1,)."""
+            grown = 1.0 + variances[0] * sizes
+            value = 0.5 * float(np.sum(variances[0] * squares / grown - np.log(grown)))
+            return value, np.array([0.5 * float(np.sum((squares / grown - sizes) / grown))])
 
         return evidence
 
@@ -313,24 +318,15 @@ def _most_evident(
 ) -> tuple[float, NDArray[np.float64]]:
     """The largest log-evidence, with its log prior odds, of a family of priors of a block; its covariance (n, n)."""
     floored = [term + LEAST_VARIANCE * np.eye(len(term)) for term in terms]
-    limits = np.log(block.amplitudes)
-    if len(floored) == 1:
-        evidence = seen.log_evidence_of_one(floored[0])
-        ends, log = [evidence(float(np.exp(2.0 * end))) for end in limits], float(limits[0])
-        if limits[0] < limits[1]:
-            inner = optimize.minimize_scalar(
-                lambda log: -evidence(float(np.exp(2.0 * log))), bounds=tuple(limits), method="bounded"
-            )
-            ends.append(-float(inner.fun))
-            log = (*limits.tolist(), float(inner.x))[int(np.argmax(ends))]
-        return odds + max(ends), np.exp(2.0 * log) * floored[0]
+    evidence = seen.of_one_term(floored[0]) if len(floored) == 1 else partial(seen.log_evidence, floored)
 
     def worse(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """Minus the log-evidence at ln of the amplitudes (n_terms,), with its derivative."""
         squares = np.exp(2.0 * logs)
-        evidence, slopes = seen.log_evidence(floored, squares)
-        return -evidence, -2.0 * squares * slopes
+        value, slopes = evidence(squares)
+        return -value, -2.0 * squares * slopes
 
+    limits = np.log(block.amplitudes)
     start = np.zeros(len(terms)).clip(*limits)
     best = optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=[tuple(limits)] * len(terms))
     squares = np.exp(2.0 * best.x)

@@ -52,31 +52,34 @@ class Linearisation:
         residuals: Residuals,
         columns: NDArray[np.int64],
         jacobian: Jacobian,
-        weights: NDArray[np.float64] | None = None,
+        weights: NDArray[np.float64],
+        information: NDArray[np.float64] | None = None,
     ) -> Linearisation:
-        """That of residuals with a Jacobian (n, n_columns); weights (n,): None, robust ones by the loss."""
-        if weights is None:
-            weights = _robust_weights(observation, residuals)
+        """That of residuals with a Jacobian and weights; information (n_columns, n_columns): None, it is formed."""
         believed = observation.weighting.precision * weights
-        score, information = jacobian.transposed_times(believed * residuals.values), jacobian.gram(believed)
+        score = jacobian.transposed_times(believed * residuals.values)
+        information = jacobian.gram(believed) if information is None else information
         return cls(observation, state, residuals, columns, jacobian, weights, score, information)
+
+    def with_errors(self, errors: NDArray[np.float64]) -> Linearisation:
+        """The same with residuals that are larger by errors (n,), in their unit."""
+        residuals = replace(self.residuals, values=self.residuals.values + errors)
+        own = (self.columns, self.jacobian, self.weights, self.information)
+        return Linearisation.of(self.observation, self.state, residuals, *own)
 
     def moved(self, observation: Observation, step: NDArray[np.float64]) -> Linearisation:
         """That of the residuals r + J d after a step d (n_unknowns,), as an observation otherwise weighted has them.
 
-        The weights of most residuals stay: their part of the information is not formed again.
+        Where the weights of most residuals stay, their part of the information is not formed again.
         """
         values = self.residuals.values + self.jacobian.times(step[self.columns])
         residuals = observation.weighed(replace(self.residuals, values=values))
         weights, precision = _robust_weights(observation, residuals), observation.weighting.precision
-        change = precision * (weights - self.weights)
-        if np.count_nonzero(change) > self.jacobian.by_displacement.shape[1]:  # the whole costs less
-            return Linearisation.of(observation, self.state, residuals, self.columns, self.jacobian, weights)
-        information = self.jacobian.regram(precision / self.precision * self.information, change)
-        score = self.jacobian.transposed_times(precision * weights * values)
-        return replace(
-            self, observation=observation, residuals=residuals, weights=weights, score=score, information=information
-        )
+        change, information = precision * (weights - self.weights), None
+        if np.count_nonzero(change) <= self.jacobian.by_displacement.shape[1]:  # else the whole costs less
+            scaled = precision / self.precision * self.information
+            information = self.jacobian.changed_gram(scaled, change)
+        return Linearisation.of(observation, self.state, residuals, self.columns, self.jacobian, weights, information)
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +307,8 @@ class Objective:
             direct = None if residuals.direct is None else (residuals.direct, self._by_material(s, unknowns))
             number = numbers.get(observation.name)
             jacobian = jacobian_of(residuals.jacobian, tangent[rows], number=number, n_offsets=n_offsets, direct=direct)
-            return Linearisation.of(observation, s, residuals, columns, jacobian)
+            weights = _robust_weights(observation, residuals)
+            return Linearisation.of(observation, s, residuals, columns, jacobian, weights)
 
         return mapped(line, zip(state.slices, seen, strict=True))
 

@@ -55,7 +55,7 @@ class Jacobian:
         root = sparse.csr_matrix((scaled, matrix.indices, matrix.indptr), shape=matrix.shape)
         return np.asarray(self.tangent.T @ (sparse.csr_matrix(root.T @ root) @ self.tangent))
 
-    def regram(self, gram: NDArray[np.float64], change: NDArray[np.float64]) -> NDArray[np.float64]:
+    def changed_gram(self, gram: NDArray[np.float64], change: NDArray[np.float64]) -> NDArray[np.float64]:
         """J^T (W + diag(change)) J (n_columns, n_columns) from the gram J^T W J; change (n,) of weights, few not 0."""
         rows = np.flatnonzero(change)
         formed = np.asarray(self.by_displacement[rows] @ self.tangent)

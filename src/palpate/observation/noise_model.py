@@ -122,12 +122,12 @@ class FitResponse:
     def _products(self, length: float, seen: Sequence[_Pairs]) -> NDArray[np.float64]:
         """Sums (BINS,) of what is left in each pair, times n_i.n_j."""
         centres, carried = self._carried(WITHIN * length)
-        kernel = _between(centres, centres, length)
+        kernel = _gaussian_between(centres, centres, length)
         n_unknowns = self.gains[0].shape[1]
         by_errors = sum(((part @ kernel) @ part.T for part in carried), np.zeros((n_unknowns, n_unknowns)))  # G K G^T
         products = np.zeros(BINS)
         for pairs in seen:
-            across = _between(centres, pairs.places, length)
+            across = _gaussian_between(centres, pairs.places, length)
             pulled = sum(((part @ across) * pairs.normals[:, a] for a, part in enumerate(carried)), np.zeros(()))  # G K
             taken = pairs.jacobian @ (pulled - 0.5 * by_errors @ pairs.jacobian.T)
             left = _gaussian(pairs.distance, length) * pairs.cosine - (taken + taken.T)[pairs.near]
@@ -264,7 +264,7 @@ def _gaussian(distance: NDArray[np.float64], length: float) -> NDArray[np.float6
     return np.asarray(np.exp(-(distance**2) / (2.0 * length**2)))
 
 
-def _between(one: NDArray[np.float64], other: NDArray[np.float64], length: float) -> NDArray[np.float64]:
+def _gaussian_between(one: NDArray[np.float64], other: NDArray[np.float64], length: float) -> NDArray[np.float64]:
     """That correlation (n, m) between places (n, 3) and (m, 3) mm, made in place: it is the largest thing here."""
     kernel = cdist(one, other, "sqeuclidean")
     kernel *= -0.5 / length**2

@@ -92,7 +92,7 @@ class FastPath:
     def _moved(self, errors: Errors, lines: tuple[Linearisation, ...] = ()) -> tuple[Linearisation, ...]:
         """Lines, by default those at the estimate, with their residuals changed."""
         pairs = zip(lines or self.least.evaluation.linearisations, errors, strict=True)
-        return tuple(replace(o, residuals=replace(o.residuals, values=o.residuals.values + e)) for o, e in pairs)
+        return tuple(line.with_errors(error) for line, error in pairs)
 
     def _shift(self, found: Minimum) -> Shift:
         theta, least = (of.unknowns[: self.fixed.n_parameters] for of in (found, self.least))
