@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
@@ -101,24 +100,34 @@ class FrozenState:
     square: NDArray[np.float64]
 
     def coordinates(
-        self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64], offsets: NDArray[np.float64]
+        self,
+        moduli: NDArray[np.float64],
+        coefficients: NDArray[np.float64],
+        offsets: NDArray[np.float64],
+        amplitude: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Z (k,) at moduli (n_regions,) kPa, coefficients (n_modes,) and offsets (n_offsets,)."""
-        boundary = coefficients[: self.reduced.n_boundary]
+        """Z (k,) at moduli (n_regions,) kPa, coefficients (n_modes,) and offsets (n_offsets,).
+
+        amplitude (m,): that there, where it is known.
+        """
+        if amplitude is None:
+            amplitude = self.reduced.amplitude(moduli, np.append(coefficients[: self.reduced.n_boundary], ONE))
         further = [] if self.expanded is None else [np.log(moduli / self.expanded)]
-        amplitude = self.reduced.amplitude(moduli, np.concatenate([boundary, ONE]))
         return np.concatenate([amplitude, coefficients, *further, offsets, ONE])
 
-    def slopes(
-        self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64], n_offsets: int
+    def straight(
+        self, forms: NDArray[np.float64], by_unknowns: NDArray[np.float64], n_modes: int
     ) -> NDArray[np.float64]:
-        """Derivatives (k, n_regions + n_modes + n_offsets) of z by ln E, coefficients and offsets."""
-        n, m = len(moduli), len(coefficients)
-        amplitude = self.reduced.solve(moduli, coefficients).amplitude_tangent()
-        rows = [np.pad(amplitude, ((0, 0), (0, n + m - amplitude.shape[1]))), np.eye(m, n + m, n)]
-        rows += [] if self.expanded is None else [np.eye(n, n + m)]
-        whole = linalg.block_diag(np.concatenate(rows), np.eye(n_offsets))
-        return np.pad(whole, ((0, 1), (0, 0)))
+        """L^T (n, r) of linear forms (r, k - m) of z beyond its amplitudes: forms of the state's own unknowns.
+
+        These are what acts on moduli, coefficients and offsets; by_unknowns (n_regions, n_moduli): derivatives of ln E
+        by the former.
+        """
+        expanded = 0 if self.expanded is None else len(self.expanded)
+        regions = forms[:, n_modes : n_modes + expanded] @ by_unknowns[:expanded]
+        n_moduli = by_unknowns.shape[1]
+        of_moduli = regions if expanded else np.zeros((len(forms), n_moduli))
+        return np.concatenate([of_moduli, forms[:, :n_modes], forms[:, n_modes + expanded : -1]], axis=1).T
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,17 +163,26 @@ class FrozenPosterior:
         """
         parameters = self.objective.parameters
         moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
-        pull = self.prior @ away
+        pull, by_unknowns = self.prior @ away, parameters.derivatives(unknowns)
         value, score, matrix, misfit = 0.5 * float(away @ pull), pull.copy(), self.prior.copy(), 0.0
         for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
-            offsets, own = parameters.offsets(unknowns, s), parameters.unknowns_of(s)
-            z = state.coordinates(moduli, coefficients, offsets)
-            slopes = parameters.by_unknowns(state.slopes(moduli, coefficients, len(offsets)), unknowns)
-            force = state.form @ z
+            there, own = state.reduced.solve(moduli, coefficients), parameters.unknowns_of(s)
+            z = state.coordinates(moduli, coefficients, parameters.offsets(unknowns, s), there.amplitude)
+            curved, m = parameters.by_unknowns(there.amplitude_tangent(), unknowns), len(there.amplitude)
+            force, n = state.form @ z, curved.shape[1]
             value += 0.5 * float(z @ force)
             misfit += float(z @ (state.square @ z))
-            score[own] += slopes.T @ force
-            matrix[np.ix_(own, own)] += slopes.T @ (state.form @ slopes)
+            # D = [A; L]: amplitudes are moved by moduli and boundary modes alone, the rest by itself
+            across = state.straight(curved.T @ state.form[:m, m:], by_unknowns, len(coefficients))
+            beyond = state.straight(state.form[m:, m:], by_unknowns, len(coefficients))
+            added = state.straight(beyond, by_unknowns, len(coefficients))
+            added[:, :n] += across
+            added[:n] += across.T
+            added[:n, :n] += curved.T @ (state.form[:m, :m] @ curved)
+            pulled = state.straight(force[None, m:], by_unknowns, len(coefficients))[:, 0]
+            pulled[:n] += curved.T @ force[:m]
+            score[own] += pulled
+            matrix[np.ix_(own, own)] += added
         return Evaluation(value, misfit, score, matrix, (), self.prior, pull)
 
 

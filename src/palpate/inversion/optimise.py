@@ -110,9 +110,6 @@ class TrustRegion:
         return TrustRegion(min(2.0 * self.radius, RADIUS) if share > 1.0 - BAD and grows else self.radius, damping)
 
 
-WHOLE = TrustRegion(np.inf, 0.0)  # the step to the minimum of the quadratic model
-
-
 def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
     """Standard deviations (n_parameters,) of the log-moduli by the Gauss-Newton matrix.
 
@@ -161,12 +158,14 @@ def gauss_newton(
             outcome = Outcome.NOT_FINITE
             break
         free = _free(objective, unknowns, now, bounds, fixed)
-        decrement = newton_decrement(now, free)
+        quadratic = _QuadraticModel.of(now, free, n)
+        whole = quadratic.step()
+        decrement = -0.5 * float(now.score @ whole)
         history.append(Iterate(unknowns[:n], now.value, now.misfit_mm2, decrement))
-        if decrement < tolerance and np.all(np.abs(_step(now, free, n, WHOLE)[:n]) < within):
+        if decrement < tolerance and np.all(np.abs(whole[:n]) < within):
             outcome = Outcome.CONVERGED
             break
-        found, trials, solved = _search(objective, unknowns, now, free=free, bounds=bounds, region=region)
+        found, trials, solved = _search(objective, unknowns, now, quadratic, bounds=bounds, region=region)
         evaluations += trials
         if found is None:
             near = decrement < tolerance
@@ -180,15 +179,16 @@ def _search(
     objective: LeastSquares,
     unknowns: NDArray[np.float64],
     now: Evaluation,
+    undamped: _QuadraticModel,
     *,
-    free: NDArray[np.bool_],
     bounds: Bounds,
     region: TrustRegion,
 ) -> tuple[tuple[NDArray[np.float64], Evaluation, TrustRegion] | None, int, bool]:
     """First step that reduces the objective, with the next region, or None; the trials; whether any was solved."""
     n, solved = objective.n_parameters, False
     for trials in range(TRIALS):
-        trial = unknowns + _step(now, free, n, region)
+        quadratic = _QuadraticModel.of(now, undamped.free, n, damping=region.damping) if region.damping else undamped
+        trial = unknowns + quadratic.step(region.radius)
         trial[:n] = np.clip(trial[:n], bounds.lower, bounds.upper)
         step = trial - unknowns
         longest = float(np.abs(step[:n]).max(initial=0.0))
@@ -220,29 +220,57 @@ def _free(
     return np.concatenate([~still, np.ones(len(unknowns) - n, dtype=bool)])
 
 
-def newton_decrement(now: Evaluation, free: NDArray[np.bool_] | slice = slice(None)) -> float:
-    """s^T H^-1 s / 2 of score s and Gauss-Newton matrix H, by the `free` (n,) unknowns: what a step still promises."""
-    matrix, score = now.matrix[free][:, free], now.score[free]
-    return float(0.5 * score @ _solve(matrix, score))
+def newton_decrement(now: Evaluation) -> float:
+    """s^T H^-1 s / 2 of score s and Gauss-Newton matrix H: what a step of all unknowns still promises."""
+    return float(0.5 * now.score @ _solve(now.matrix, now.score[:, None])[:, 0])
 
 
-def _step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int, region: TrustRegion) -> NDArray[np.float64]:
-    """Damped Gauss-Newton step (n,) whose log-moduli stay within the radius."""
-    matrix = now.matrix + region.damping * np.diag(np.diag(now.matrix))
-    ridge = np.diag(np.where(np.arange(len(free)) < n_parameters, np.diag(now.matrix), 0.0))
-    step = np.zeros(len(free))
-    weight = 0.0
-    for _ in range(60):
-        step[free] = -_solve((matrix + weight * ridge)[np.ix_(free, free)], now.score[free])
-        if np.abs(step[:n_parameters]).max(initial=0.0) <= region.radius * 1.01:
-            break
-        weight = max(2.0 * weight, 0.05)
-    return step
+@dataclass(frozen=True, slots=True)
+class _QuadraticModel:
+    """An objective with the score s and the matrix H around a place, all but its free log-moduli eliminated.
+
+    Steps d of the log-moduli t and of the other unknowns q: H_qq d_q = -s_q - H_qt d_t, hence d_q = -rest - slopes d_t,
+    rest (m,) and slopes (m, k). matrix (k, k): H_tt - H_tq slopes; score (k,): s_t - H_tq rest; diagonal (k,): of H_tt.
+    """
+
+    free: NDArray[np.bool_]
+    matrix: NDArray[np.float64]
+    score: NDArray[np.float64]
+    diagonal: NDArray[np.float64]
+    slopes: NDArray[np.float64]
+    rest: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls, now: Evaluation, free: NDArray[np.bool_], n_parameters: int, *, damping: float = 0.0
+    ) -> _QuadraticModel:
+        """Around an evaluation, with the damped matrix H + damping diag H."""
+        moduli = np.flatnonzero(free[:n_parameters])
+        matrix = now.matrix + damping * np.diag(np.diag(now.matrix))
+        side, own = matrix[n_parameters:, moduli], matrix[np.ix_(moduli, moduli)]
+        solved = _solve(matrix[n_parameters:, n_parameters:], np.column_stack([side, now.score[n_parameters:]]))
+        slopes, rest = solved[:, :-1], solved[:, -1]
+        diagonal = np.diag(now.matrix)[moduli]
+        return cls(free, own - side.T @ slopes, now.score[moduli] - side.T @ rest, diagonal, slopes, rest)
+
+    def step(self, radius: float = np.inf) -> NDArray[np.float64]:
+        """Step (n,) to its minimum, or one whose log-moduli stay within the radius, by a ridge on these."""
+        step, weight = np.zeros(len(self.free)), 0.0
+        for _ in range(60):
+            theta = -_solve(self.matrix + weight * np.diag(self.diagonal), self.score[:, None])[:, 0]
+            if np.abs(theta).max(initial=0.0) <= radius * 1.01:
+                break
+            weight = max(2.0 * weight, 0.05)
+        step[self.free] = np.concatenate([theta, -self.rest - self.slopes @ theta])
+        return step
 
 
 def _solve(matrix: NDArray[np.float64], rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Solve a positive semi-definite system scaled to a unit diagonal, with a trace of ridge against rank loss."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
-    scaled = scale[:, None] * matrix * scale
+    """Solve a positive semi-definite system (n, n) scaled to a unit diagonal for rhs (n, k).
+
+    A trace of ridge stands against rank loss.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))[:, None]
+    scaled = scale * matrix * scale.T
     scaled[np.diag_indices_from(scaled)] += 1e-12
     return np.asarray(scale * np.linalg.solve(scaled, scale * rhs))
