@@ -96,6 +96,19 @@ class Ray:
         limits = np.where(self.direction > 0.0, self.bounds.upper, self.bounds.lower)
         return float(np.min((limits - theta)[along] / self.direction[along]))
 
+    def _slope(self) -> NDArray[np.float64]:
+        """Change (n_unknowns,) of all unknowns for a distance of 1 at the minimum, those that are not held following.
+
+        H_ff s_f = -H_fh s_h with the Gauss-Newton matrix H; a log-modulus at a bound stays.
+        """
+        n, evaluation = len(self.direction), self.least.evaluation
+        slope = np.pad(self.direction, (0, len(evaluation.score) - n))
+        still = self.held | self.bounds.reached(self.least.unknowns[:n])
+        free = np.pad(~still, (0, len(slope) - n), constant_values=True)
+        pulled = evaluation.matrix[free][:, ~free] @ slope[~free]
+        slope[free] = -np.linalg.solve(evaluation.matrix[np.ix_(free, free)], pulled)
+        return slope
+
     def _at_its_best(self, start: NDArray[np.float64]) -> Minimum:
         """All that is not held at its best, sought from unknowns (n,), and once more from where that did not end."""
         for _ in range(TRIES):
@@ -115,14 +128,15 @@ class Ray:
         held, nothing is known of any end.
         """
         bound, n = self.bound, len(self.direction)
-        unknowns, points, inside, outside = self.least.unknowns, list[tuple[float, float]](), (0.0, 0.0), None
+        least, points, inside, outside = self.least.unknowns, list[tuple[float, float]](), (0.0, 0.0), None
         distance = first
         if bound <= 0.0 or not self.least.converged:
             return [], None
+        slope = self._slope()
         for _ in range(TRIALS):
             at_bound, distance = distance >= bound, min(distance, bound)
-            start, there = unknowns.copy(), self.least.unknowns[:n] + distance * self.direction
-            start[:n][self.held] = there[self.held]
+            start = least + distance * slope
+            start[:n] = np.clip(start[:n], self.bounds.lower, self.bounds.upper)
             try:
                 found = self._at_its_best(start)
             except SolverError:
@@ -132,12 +146,13 @@ class Ray:
             if not (found.converged or root < (1.0 - NEAR) * level):
                 return points, None
             points.append((distance, root))
+            slope = (found.unknowns - least) / distance
             if abs(root - level) < NEAR * level:
                 return points, distance * level / root
             if root < level:
                 if at_bound:
                     return points, None
-                inside, unknowns = (distance, root), found.unknowns
+                inside = (distance, root)
             else:
                 outside = (distance, root)
             if outside is None:
