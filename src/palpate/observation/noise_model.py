@@ -71,8 +71,8 @@ class NoiseModel:
             variance, length = of
             centres, carried = _carried(rows, places, normals, 0.5 * length)
             i, j = cKDTree(centres).query_pairs(3.5 * length, output_type="ndarray").T
-            apart = np.linalg.norm(centres[i] - centres[j], axis=1)
-            once = sparse.csr_matrix((_gaussian(apart, length), (i, j)), shape=(len(centres),) * 2)
+            apart = np.sqrt(sum((x[i] - x[j]) ** 2 for x in np.ascontiguousarray(centres.T)))
+            once = sparse.coo_matrix((_gaussian(apart, length), (i, j)), shape=(len(centres),) * 2)
             across = sum((part @ _times(once, part.T) for part in carried), np.zeros((len(rows),) * 2))
             return variance * (across + across.T + sum((part @ part.T for part in carried), np.zeros(across.shape)))
 
@@ -235,7 +235,9 @@ def _cell_means(places: NDArray[np.float64], most: int) -> sparse.csr_matrix[np.
     return sparse.csr_matrix(every[chosen])
 
 
-def _times(cells: sparse.csr_matrix[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _times(
+    cells: sparse.csr_matrix[np.float64] | sparse.coo_matrix[np.float64], values: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """What a sparse matrix (m, n), of cells as a rule, makes of values (n,) or (n, k)."""
     return np.asarray(cells @ values, dtype=np.float64)
 
