@@ -101,33 +101,29 @@ class FrozenState:
 
     def coordinates(
         self,
+        amplitude: NDArray[np.float64],
         moduli: NDArray[np.float64],
         coefficients: NDArray[np.float64],
         offsets: NDArray[np.float64],
-        amplitude: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Z (k,) at moduli (n_regions,) kPa, coefficients (n_modes,) and offsets (n_offsets,).
-
-        amplitude (m,): that there, where it is known.
-        """
-        if amplitude is None:
-            amplitude = self.reduced.amplitude(moduli, np.append(coefficients[: self.reduced.n_boundary], ONE))
+        """Z (k,) of the amplitude (m,) at moduli (n_regions,) kPa, coefficients (n_modes,) and offsets (n_offsets,)."""
         further = [] if self.expanded is None else [np.log(moduli / self.expanded)]
         return np.concatenate([amplitude, coefficients, *further, offsets, ONE])
 
-    def straight(
-        self, forms: NDArray[np.float64], by_unknowns: NDArray[np.float64], n_modes: int
+    def transposed_times(
+        self, values: NDArray[np.float64], amplitude_slopes: NDArray[np.float64], modulus_slopes: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """L^T (n, r) of linear forms (r, k - m) of z beyond its amplitudes: forms of the state's own unknowns.
+        """D^T y (n_own, r) for y (k, r), D the derivatives of z by the state's own unknowns.
 
-        These are what acts on moduli, coefficients and offsets; by_unknowns (n_regions, n_moduli): derivatives of ln E
-        by the former.
+        amplitude_slopes (m, n): of the amplitudes, by the first n of these, what acts on moduli and boundary modes;
+        modulus_slopes (n_regions, n_moduli): of ln E by the former. The other coordinates are unknowns themselves.
         """
-        expanded = 0 if self.expanded is None else len(self.expanded)
-        regions = forms[:, n_modes : n_modes + expanded] @ by_unknowns[:expanded]
-        n_moduli = by_unknowns.shape[1]
-        of_moduli = regions if expanded else np.zeros((len(forms), n_moduli))
-        return np.concatenate([of_moduli, forms[:, :n_modes], forms[:, n_modes + expanded : -1]], axis=1).T
+        parts = [len(amplitude_slopes), len(amplitude_slopes) + self.reduced.n_modes]
+        amplitudes, coefficients, rest = np.split(values[:-1], parts)
+        expanded, offsets = np.split(rest, [0 if self.expanded is None else len(self.expanded)])
+        found = np.concatenate([modulus_slopes[: len(expanded)].T @ expanded, coefficients, offsets])
+        found[: amplitude_slopes.shape[1]] += amplitude_slopes.T @ amplitudes
+        return np.asarray(found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +148,8 @@ class FrozenPosterior:
         moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
         total = 0.5 * float(away @ self.prior @ away)
         for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
-            z = state.coordinates(moduli, coefficients, parameters.offsets(unknowns, s))
+            amplitude = state.reduced.amplitude(moduli, np.append(coefficients[: state.reduced.n_boundary], ONE))
+            z = state.coordinates(amplitude, moduli, coefficients, parameters.offsets(unknowns, s))
             total += 0.5 * float(z @ (state.form @ z))
         return total
 
@@ -163,26 +160,17 @@ class FrozenPosterior:
         """
         parameters = self.objective.parameters
         moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
-        pull, by_unknowns = self.prior @ away, parameters.derivatives(unknowns)
+        pull, modulus_slopes = self.prior @ away, parameters.derivatives(unknowns)
         value, score, matrix, misfit = 0.5 * float(away @ pull), pull.copy(), self.prior.copy(), 0.0
         for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
             there, own = state.reduced.solve(moduli, coefficients), parameters.unknowns_of(s)
-            z = state.coordinates(moduli, coefficients, parameters.offsets(unknowns, s), there.amplitude)
-            curved, m = parameters.by_unknowns(there.amplitude_tangent(), unknowns), len(there.amplitude)
-            force, n = state.form @ z, curved.shape[1]
+            z = state.coordinates(there.amplitude, moduli, coefficients, parameters.offsets(unknowns, s))
+            amplitude_slopes, force = parameters.by_unknowns(there.amplitude_tangent(), unknowns), state.form @ z
             value += 0.5 * float(z @ force)
             misfit += float(z @ (state.square @ z))
-            # D = [A; L]: amplitudes are moved by moduli and boundary modes alone, the rest by itself
-            across = state.straight(curved.T @ state.form[:m, m:], by_unknowns, len(coefficients))
-            beyond = state.straight(state.form[m:, m:], by_unknowns, len(coefficients))
-            added = state.straight(beyond, by_unknowns, len(coefficients))
-            added[:, :n] += across
-            added[:n] += across.T
-            added[:n, :n] += curved.T @ (state.form[:m, :m] @ curved)
-            pulled = state.straight(force[None, m:], by_unknowns, len(coefficients))[:, 0]
-            pulled[:n] += curved.T @ force[:m]
-            score[own] += pulled
-            matrix[np.ix_(own, own)] += added
+            score[own] += state.transposed_times(force[:, None], amplitude_slopes, modulus_slopes)[:, 0]
+            halfway = state.transposed_times(state.form, amplitude_slopes, modulus_slopes)
+            matrix[np.ix_(own, own)] += state.transposed_times(halfway.T, amplitude_slopes, modulus_slopes)
         return Evaluation(value, misfit, score, matrix, (), self.prior, pull)
 
 
@@ -216,7 +204,7 @@ def frozen_posterior(
             answer = np.concatenate([answer[:, : modes.stop], rest[:, : model.n_regions]], axis=1)
         offsets = parameters.offsets(unknowns, s)
         bare = FrozenState(reduced.outputs(lambda values: values[:0]), expanded, *(np.zeros((0, 0)),) * 2)
-        z = bare.coordinates(moduli, coefficients[s], offsets)
+        z = bare.coordinates(bare.reduced.solve(moduli, coefficients[s]).amplitude, moduli, coefficients[s], offsets)
         form, square = np.zeros((len(z), len(z))), np.zeros((len(z), len(z)))
         for rows, line in zip(objective.states[s].slices, lines, strict=True):
             of_offsets = line.jacobian.tangent[:, line.jacobian.shape[1] - len(offsets) :]

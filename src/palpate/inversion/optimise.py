@@ -229,8 +229,9 @@ def newton_decrement(now: Evaluation) -> float:
 class _QuadraticModel:
     """An objective with the score s and the matrix H around a place, all but its free log-moduli eliminated.
 
-    Steps d of the log-moduli t and of the other unknowns q: H_qq d_q = -s_q - H_qt d_t, hence d_q = -rest - slopes d_t,
-    rest (m,) and slopes (m, k). matrix (k, k): H_tt - H_tq slopes; score (k,): s_t - H_tq rest; diagonal (k,): of H_tt.
+    free (n,): which unknowns move. Steps d of their log-moduli t and of the others q: H_qq d_q = -s_q - H_qt d_t, hence
+    d_q = -rest - slopes d_t, rest (m,) and slopes (m, k). matrix (k, k): H_tt - H_tq slopes; score (k,): s_t -
+    H_tq rest; diagonal (k,): of H_tt.
     """
 
     free: NDArray[np.bool_]
