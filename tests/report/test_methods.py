@@ -145,3 +145,17 @@ def test_an_interval_from_the_profile_is_told_of(case_result):
     told = " ".join(methods_text(collect(dataclasses.replace(case_result, estimation=estimation))).paragraphs)
     assert "of prostate, whose profile likelihood leans to one side" in told
     assert "leans" not in " ".join(methods_text(collect(case_result)).paragraphs)
+
+
+def test_intervals_are_said_to_cover_what_is_unknown_and_no_error_of_what_is_given(case_result):
+    def told(**shares):
+        first, second = case_result.estimation.estimates
+        estimates = (dataclasses.replace(first, variance_shares={"noise": 0.5, **shares}), second)
+        estimation = dataclasses.replace(case_result.estimation, estimates=estimates)
+        return methods_text(collect(dataclasses.replace(case_result, estimation=estimation))).paragraphs[-1]
+
+    assert "They do not cover the errors of the material law, the boundary condition, given Poisson" in told()
+    assert "allow for" not in told()
+    text = told(frame=0.2, poisson=0.3, offset=0.0)
+    assert "They allow for the frame's motion and Poisson's ratios." in text
+    assert "They do not cover the errors of the material law and the given moduli." in text

@@ -9,8 +9,9 @@ from typing import Any
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.report.report_data import MAP_OF, MESH, VARIATION, ReportData
-from palpate.report.rows import listed, moduli_in, ratio_rows
+from palpate.report.rows import CAUSES, listed, moduli_in, ratio_rows
 from palpate.report.sources import SOURCES, bibtex, reference_line
+from palpate.unknowns import KNOWN_MODULUS
 
 ELEMENTS = {
     "P1": "linear tetrahedra",
@@ -22,6 +23,8 @@ ALIGNED = {
     "rigid-tissues": " The later images were brought to the first on the rigid tissues.",
     "surfaces": " The later images were brought to the first by the rigid motion that most of the surfaces agree on.",
 }
+UNKNOWNS = tuple(cause for cause in CAUSES if cause not in ("noise", "prior", "grid", "mesh"))
+GIVEN = {"frame": "the boundary condition", "poisson": "given Poisson's ratios", KNOWN_MODULUS: "the given moduli"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +60,7 @@ def methods_text(data: ReportData) -> Methods:
         (
             "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated"
             f" residuals {cite('white')}, with the scatter over the voxel grid's position and a term for the mesh"
-            f" added{leaning}. They do not cover the errors of the material law, of given Poisson's ratios, of the"
-            " boundary condition and of the given moduli. The seed of random numbers was"
-            f" {data.document['seed']}."
+            f" added{leaning}.{_covered(data)} The seed of random numbers was {data.document['seed']}."
         ),
     )
     own = SOURCES["palpate"]
@@ -70,6 +71,15 @@ def methods_text(data: ReportData) -> Methods:
         tuple(reference_line(sources[key]) for key in cite.cited),
         "\n\n".join(bibtex(key, sources[key]) for key in cite.cited),
     )
+
+
+def _covered(data: ReportData) -> str:
+    """Which unknowns the intervals allow for, and the errors of what is given, which they do not cover."""
+    shares = [share for item in moduli_in(data.document) for share in (item.get("variance_shares") or {}).items()]
+    counted = {cause for cause, share in shares if share > 0.0}
+    allowed = listed([CAUSES[cause] for cause in UNKNOWNS if cause in counted])
+    given = listed(["the material law", *(words for cause, words in GIVEN.items() if cause not in counted)])
+    return (f" They allow for {allowed}." if allowed else "") + f" They do not cover the errors of {given}."
 
 
 def _aim(data: ReportData, cite: _Citations) -> str:
