@@ -29,15 +29,16 @@ LATTICE = 64  # points of the lattice along the longest side, on which edge leng
 # Fitted to the runs of benchmarks/cost.py (docs/command-line.md), on two cores of a 2.1 GHz server.
 TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
-FIXED_S: Mapping[Stage, float] = {"reading": 3.2, "linear law": 3.0, "intervals": 3.4, "report": 4.2}
-SECONDS_AN_UNKNOWN = 2.2e-4  # beside the solver, with 90 modes a driver, for each later image
-FINITE_STRAIN_S = 2.0e-4  # the same of equilibria and their derivatives at finite strain
+FIXED_S: Mapping[Stage, float] = {"reading": 5.0, "linear law": 4.0, "intervals": 5.0, "report": 8.0}
+SECONDS_AN_UNKNOWN = 4.6e-4  # beside the solver, with 90 modes a driver, for each later image
+FINITE_STRAIN_S = 4.2e-4  # the same of equilibria and their derivatives at finite strain
+INTERVALS_S = 4.6e-4  # the same of intervals, and of what would change the answer
 FROM_REST = 2  # further passes, each with a linear one, where the state without loads is found with the moduli
 SECONDS_A_DRAW = 7.5e-3  # of the posterior, in four chains, with 90 modes, for each later image
 SECONDS_A_CUT = 2.0e-4  # of meshing, for each tetrahedron and each tissue that is cut out
 PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
 FIXED_GB = 0.48
-GB_AN_UNKNOWN = 1.07e-5  # beside the factor, with 90 modes
+GB_AN_UNKNOWN = 1.7e-5  # beside the factor, with 90 modes
 BYTES_A_VOXEL = 6.0  # of each image: the tissue of each voxel, and masks
 BYTES_A_DISTANCE = 81.0  # while the distance map of a tissue is made, for each voxel around it
 LESS_MEMORY = 'make mesh.edge_length_mm larger, or domain.extent = "margin" with a smaller margin_mm'
@@ -104,6 +105,7 @@ def cost_of_meshes(
         took["finite strain"] += finite * FINITE_STRAIN_S * work * shorter
         if case.strained_reference:
             took["finite strain"] += FROM_REST * (SECONDS_AN_UNKNOWN + FINITE_STRAIN_S) * work * shorter
+        took["intervals"] += INTERVALS_S * work * shorter
         took["intervals"] += SECONDS_A_DRAW * case.estimate.samples * modes * max(n_after, 1)
         gigabytes += GB_AN_UNKNOWN * work + solving.bytes / 1e9
     return ExpectedCost(
