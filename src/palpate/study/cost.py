@@ -26,7 +26,7 @@ from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of
 MEMORY_FACTOR = 1.5  # how far the predicted memory may be off
 
 LATTICE = 64  # points of the lattice along the longest side, on which edge lengths are summed
-# Fitted to the runs of benchmarks/cost.py (docs/command-line.md), on two cores of a 2.1 GHz server.
+# Fitted to runs of benchmarks/cost.py (docs/command-line.md), between machines that take 110 and 160 s for the demo.
 TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
 FIXED_S: Mapping[Stage, float] = {"reading": 5.0, "linear law": 4.0, "intervals": 5.0, "report": 8.0}
