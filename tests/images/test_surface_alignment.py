@@ -7,9 +7,14 @@ import pytest
 
 from bodies import ELSEWHERE, STILL, body
 from palpate.errors import InputDataError
-from palpate.images.alignment import RigidMotion, moved
+from palpate.images.alignment import RigidFit, RigidMotion, moved
 from palpate.images.registration import registration
-from palpate.images.surface_alignment import align_surfaces
+from palpate.images.segmentation import Segmentation
+from palpate.images.surface_alignment import align_surfaces, surface_maps
+
+
+def aligned(before: Segmentation, after: Segmentation) -> RigidFit:
+    return align_surfaces(before, surface_maps(before, after))
 
 
 def error(found: RigidMotion, truth: RigidMotion) -> tuple[float, float]:
@@ -21,7 +26,7 @@ def error(found: RigidMotion, truth: RigidMotion) -> tuple[float, float]:
 
 @pytest.mark.parametrize("skin", [True, False])
 def test_a_body_that_moves_as_a_whole_is_found_to_fractions_of_a_voxel(skin):
-    fit = align_surfaces(body(STILL, skin=skin), body(ELSEWHERE, skin=skin, seed=1))
+    fit = aligned(body(STILL, skin=skin), body(ELSEWHERE, skin=skin, seed=1))
     shift, turn = error(fit.motion, ELSEWHERE)
     assert shift < 0.25
     assert turn < 0.8
@@ -31,7 +36,7 @@ def test_a_body_that_moves_as_a_whole_is_found_to_fractions_of_a_voxel(skin):
 @pytest.mark.parametrize("filling", [3.0, 6.0])
 @pytest.mark.parametrize("skin", [True, False])
 def test_organs_that_move_by_themselves_do_not_hide_the_motion_of_the_whole(filling, skin):
-    fit = align_surfaces(body(STILL, skin=skin), body(ELSEWHERE, filling=filling, skin=skin, seed=1))
+    fit = aligned(body(STILL, skin=skin), body(ELSEWHERE, filling=filling, skin=skin, seed=1))
     shift, turn = error(fit.motion, ELSEWHERE)
     assert shift < 1.2
     assert turn < 1.6
@@ -40,12 +45,12 @@ def test_organs_that_move_by_themselves_do_not_hide_the_motion_of_the_whole(fill
 @pytest.mark.parametrize("filling", [0.0, 3.0, 6.0])
 @pytest.mark.parametrize("skin", [True, False])
 def test_organs_that_move_by_themselves_are_no_motion_of_the_whole(filling, skin):
-    fit = align_surfaces(body(STILL, skin=skin), body(STILL, filling=filling, skin=skin, seed=1))
+    fit = aligned(body(STILL, skin=skin), body(STILL, filling=filling, skin=skin, seed=1))
     assert np.array_equal(fit.motion.matrix, np.eye(4))
 
 
 def test_a_later_image_with_a_smaller_field_of_view_shows_the_same_motion():
-    fit = align_surfaces(body(STILL), body(ELSEWHERE, filling=3.0, field=(80.0, 84.0, 70.0), seed=1))
+    fit = aligned(body(STILL), body(ELSEWHERE, filling=3.0, field=(80.0, 84.0, 70.0), seed=1))
     shift, turn = error(fit.motion, ELSEWHERE)
     assert shift < 1.0
     assert turn < 2.5
@@ -53,7 +58,7 @@ def test_a_later_image_with_a_smaller_field_of_view_shows_the_same_motion():
 
 def test_images_in_worlds_of_their_own_are_laid_on_each_other():
     away = RigidMotion(np.eye(3), np.array([150.0, -40.0, 300.0]))
-    fit = align_surfaces(body(STILL), moved(body(ELSEWHERE, filling=3.0, seed=1), away))
+    fit = aligned(body(STILL), moved(body(ELSEWHERE, filling=3.0, seed=1), away))
     shift, turn = error(fit.motion, away.compose(ELSEWHERE))
     assert shift < 1.0
     assert turn < 1.6
@@ -63,7 +68,7 @@ def test_the_motion_that_is_told_is_that_of_the_organs_wherever_the_world_begins
     before, after = body(STILL), body(ELSEWHERE, seed=1)
     away = RigidMotion(np.eye(3), np.array([500.0, -300.0, 900.0]))
     told = [
-        registration(first, second, align_surfaces(first, second), by="surfaces").row("after")
+        registration(first, surface_maps(first, second), aligned(first, second), by="surfaces").row("after")
         for first, second in ((before, after), (moved(before, away), moved(after, away)))
     ]
     np.testing.assert_allclose(
@@ -80,4 +85,4 @@ def test_the_motion_that_is_told_is_that_of_the_organs_wherever_the_world_begins
 def test_images_that_show_no_surface_away_from_their_border_are_refused():
     small = body(STILL, field=(14.0, 14.0, 14.0))
     with pytest.raises(InputDataError, match="align = 'none'"):
-        align_surfaces(small, small)
+        aligned(small, small)

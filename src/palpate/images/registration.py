@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from palpate.images.alignment import RigidFit, RigidMotion
 from palpate.images.segmentation import Segmentation
-from palpate.images.surface_alignment import residuals_by_tissue
+from palpate.images.surface_alignment import SurfaceMaps, residuals_by_tissue
 from palpate.images.tissue import Role, Tissue
 
 LEAST_MM = 0.01  # no image shows less
@@ -87,7 +87,7 @@ def length_text(mm: float) -> str:
     return f"{mm:.2g}" if mm >= LEAST_MM else f"less than {LEAST_MM:g}"
 
 
-def registration(before: Segmentation, after: Segmentation, fit: RigidFit, *, by: str) -> Registration:
+def registration(before: Segmentation, maps: SurfaceMaps, fit: RigidFit, *, by: str) -> Registration:
     """What a measured motion does to the organs, and what it leaves of each surface."""
     organs = [i for i, tissue in enumerate(before.tissues) if tissue.role is Role.ESTIMATE]
     volumes = {organ: before.volume(organ) for organ in organs if before.mask(organ).any()}
@@ -95,4 +95,4 @@ def registration(before: Segmentation, after: Segmentation, fit: RigidFit, *, by
         centre = np.average([before.middle(i) for i in volumes], axis=0, weights=list(volumes.values()))
     else:
         centre = before.grid.world((np.array([before.grid.shape]) - 1.0) / 2.0)[0]
-    return Registration(by, fit.motion, centre, fit.rms_mm, residuals_by_tissue(before, after, fit.motion))
+    return Registration(by, fit.motion, centre, fit.rms_mm, residuals_by_tissue(before, maps, fit.motion))

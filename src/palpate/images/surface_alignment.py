@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +42,8 @@ CLEARLY = 5.0  # log of the odds by which a motion must explain the images bette
 LEAST_WEIGHT = 1e-3
 MOST_STEPS = 40
 STEP_TOLERANCE_MM = 1e-3
+
+SurfaceMaps = Mapping[int, tuple[DistanceMap, DistanceMap]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +91,15 @@ def shown_tissues(segmentation: Segmentation) -> tuple[int, ...]:
     return tuple(i for i in range(len(tissues)) if i not in filler)
 
 
-def align_surfaces(before: Segmentation, after: Segmentation) -> RigidFit:
+def surface_maps(before: Segmentation, after: Segmentation) -> SurfaceMaps:
+    """Distance maps in both images of every tissue (by its index) with a surface of its own that both have."""
+    present = [set(np.unique(image.index).tolist()) for image in (before, after)]
+    tissues = [i for i in shown_tissues(before) if i in present[0] & present[1]]
+    width = SMOOTHER * smoothing_width(before.grid, after.grid)
+    return distance_pairs(before, after, tissues, smoothing_mm=width, far=False)
+
+
+def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
     """The rigid motion before -> after that most surfaces agree on; none where that explains the images about as well.
 
     Most probable motion under r_i = phi_after(R x_i + t) - phi_before(x_i) ~ N(0, K) of points x_i of every tissue's
@@ -98,7 +108,7 @@ def align_surfaces(before: Segmentation, after: Segmentation) -> RigidFit:
     It counts where it makes the images e^5 times as probable as no motion. Raises `InputDataError` when the images
     share too few surface points.
     """
-    surfaces, middles = _surfaces(before, after)
+    surfaces, middles = _surfaces(before, maps)
     if not surfaces:
         raise InputDataError(
             "no tissue shows enough of its surface in both images, away from their borders, for a motion between them"
@@ -124,42 +134,32 @@ def align_surfaces(before: Segmentation, after: Segmentation) -> RigidFit:
     return RigidFit(best.motion, rms, int(np.count_nonzero(weight)), np.zeros((0, 3)))
 
 
-def residuals_by_tissue(before: Segmentation, after: Segmentation, motion: RigidMotion) -> dict[str, float]:
-    """How far each tissue's surface lies from the later image's once it has moved so, mm: root mean square.
-
-    Of the tissues that both images show, the one left out that fills what others leave.
-    """
+def residuals_by_tissue(before: Segmentation, maps: SurfaceMaps, motion: RigidMotion) -> dict[str, float]:
+    """How far each tissue's surface lies from the later image's once it has moved so, mm: root mean square."""
     found = {}
-    for tissue, pair in _maps(before, after).items():
-        places = seen_surface(pair[0]).places
-        places = places[within_border(pair[1].grid, motion.apply(places))]
+    for tissue, (first, second) in maps.items():
+        places = seen_surface(first).places
+        places = places[within_border(second.grid, motion.apply(places))]
         if len(places) >= LEAST_POINTS:
-            distance = pair[1].at(motion.apply(places)) - pair[0].at(places)
+            distance = second.at(motion.apply(places)) - first.at(places)
             found[before.tissues[tissue].name] = float(np.sqrt(np.mean(distance**2)))
     return found
 
 
-def _maps(before: Segmentation, after: Segmentation) -> dict[int, tuple[DistanceMap, DistanceMap]]:
-    """Distance maps in both images of every tissue with a surface of its own that both have."""
-    present = [set(np.unique(image.index).tolist()) for image in (before, after)]
-    tissues = [i for i in shown_tissues(before) if i in present[0] & present[1]]
-    return distance_pairs(before, after, tissues, smoothing_mm=SMOOTHER * smoothing_width(before.grid, after.grid))
-
-
 def _surfaces(
-    before: Segmentation, after: Segmentation
+    before: Segmentation, maps: SurfaceMaps
 ) -> tuple[list[_Shown], list[tuple[NDArray[np.float64], NDArray[np.float64]]]]:
     """The surfaces that are seen, and the middles (3,) mm of each in both images."""
     surfaces, middles = [], []
-    for tissue, maps in _maps(before, after).items():
-        first, second = (seen_surface(one) for one in maps)
+    for tissue, pair in maps.items():
+        first, second = (seen_surface(one) for one in pair)
         if min(len(first.area), len(second.area)) < LEAST_POINTS:
             continue
         step = -(-len(first.area) // MOST_POINTS)
         places, normals = first.places[::step], first.normals[::step]
         alike = np.exp(-0.5 * cdist(places, places, "sqeuclidean") / LENGTH_MM**2) * (normals @ normals.T)
         own = OWN_MOTION_MM[before.tissues[tissue].role] ** 2 * alike
-        surfaces.append(_Shown(places, maps[0].at(places), maps[1], own))
+        surfaces.append(_Shown(places, pair[0].at(places), pair[1], own))
         middles.append((first.area @ first.places / first.area.sum(), second.area @ second.places / second.area.sum()))
     return surfaces, middles
 

@@ -14,7 +14,7 @@ from palpate.images.alignment import Alignment, Motion, align, moved
 from palpate.images.checks import check_headers, check_images, later_names
 from palpate.images.registration import ON, Registration, registration
 from palpate.images.segmentation import Segmentation
-from palpate.images.surface_alignment import align_surfaces
+from palpate.images.surface_alignment import align_surfaces, surface_maps
 from palpate.images.tissue import Role
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import DataSource
@@ -98,7 +98,8 @@ def brought(
             progress(f"looking for a motion of the whole in '{name}'")
             findings += check_headers(before.grid, image.grid, name)
             with suppress(InputDataError):  # too little is seen for a motion of the whole; nothing rests on it here
-                found = registration(before, image, align_surfaces(before, image), by="surfaces")
+                maps = surface_maps(before, image)
+                found = registration(before, maps, align_surfaces(before, maps), by="surfaces")
                 findings += _frame_findings(before, found, name, aligned=False)
         return ImagedStates(before, after, tuple(dict[int, Motion]() for _ in after), tuple(findings))
     rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
@@ -106,8 +107,9 @@ def brought(
         progress(f"aligning '{name}' on {ON[method]}")
         findings += check_headers(before.grid, image.grid, name)
         alignment = align(before, image) if rigid or method == "rigid-tissues" else None
-        fit = alignment.overall if alignment and method == "rigid-tissues" else align_surfaces(before, image)
-        alignments.append(registration(before, image, fit, by=method))
+        maps = surface_maps(before, image)
+        fit = alignment.overall if alignment and method == "rigid-tissues" else align_surfaces(before, maps)
+        alignments.append(registration(before, maps, fit, by=method))
         progress(f"'{name}' {alignments[-1].in_words}")
         images.append(moved(image, fit.motion.inverse()))
         bones.append({i: alignment.remaining(bone, fit) for i, bone in rigid.items()} if alignment else {})
