@@ -123,9 +123,12 @@ def distance_map(mask: NDArray[np.bool_], grid: VoxelGrid, *, smoothing_mm: floa
             values[box] = np.where(within, half - depth, values[box])
         indicator, sigma = within.astype(np.float64), smoothing_mm / grid.spacing
         share = ndimage.gaussian_filter(indicator, sigma, mode="nearest", truncate=TRUNCATED)
-        near = -smoothing_mm * special.ndtri(np.clip(share, 1e-12, 1.0 - 1e-12))
-        weight = np.clip(np.abs(near) / smoothing_mm - (PROBIT_LIMIT - 1.0), 0.0, 1.0)
-        values[box] = (1.0 - weight) * near + weight * (values[box] if far else np.clip(near, -limit, limit))
+        if not far:
+            values[box] = np.where(share > 0.5, -limit, limit)
+        near = np.abs(share - 0.5) < special.ndtr(PROBIT_LIMIT) - 0.5
+        depth = -smoothing_mm * special.ndtri(share[near])
+        weight = np.clip(np.abs(depth) / smoothing_mm - (PROBIT_LIMIT - 1.0), 0.0, 1.0) if far else 0.0
+        values[box][near] = (1.0 - weight) * depth + weight * values[box][near]
     return DistanceMap(ndimage.spline_filter(values, order=3, mode="mirror"), grid, smoothing_mm)
 
 

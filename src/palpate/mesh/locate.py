@@ -17,7 +17,7 @@ from palpate.parallel import mapped
 CANDIDATES = (8, 48, 240)  # tetrahedra that are tried, the ones with the nearest centroids first
 AT_ONCE = 200_000  # pairs of a point and a tetrahedron
 ON_A_FACE = 1e-9  # in barycentric coordinates
-VOXELS_AT_ONCE = 1_000_000  # voxel centres tested at once by a thread, which bounds the memory
+COLUMNS_AT_ONCE = 300_000  # columns of a tetrahedron that are tested at once by a thread, which bounds the memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,28 +83,42 @@ def modulus_image(mesh: TetMesh, grid: VoxelGrid, moduli: NDArray[np.float64]) -
 
 
 def tetrahedron_image(mesh: TetMesh, grid: VoxelGrid) -> NDArray[np.int32]:
-    """Number (n_x, n_y, n_z) of the tetrahedron at each voxel centre of `grid`; -1: none."""
+    """Number (n_x, n_y, n_z) of the tetrahedron at each voxel centre of `grid`; -1: none.
+
+    Along a column of voxels each barycentric coordinate is linear in z, so that a tetrahedron holds one stretch of it.
+    """
     image = np.full(grid.shape, -1, dtype=np.int32)
     corners = grid.index(mesh.nodes)[mesh.tets]
     low = np.maximum(np.ceil(corners.min(axis=1) - ON_A_FACE), 0).astype(np.int64)
     high = np.minimum(np.floor(corners.max(axis=1) + ON_A_FACE), np.array(grid.shape) - 1).astype(np.int64)
     size = np.maximum(high - low + 1, 0)
-    count = size.prod(axis=1)
-    to_barycentric = np.linalg.inv(corners[:, 1:] - corners[:, :1])  # rows: edges; x - x0 = b @ edges
+    count = np.where(size[:, 2] > 0, size[:, 0] * size[:, 1], 0)
+    edges = np.linalg.inv(corners[:, 1:] - corners[:, :1])  # rows: edges; x - x0 = b @ edges
+    by_index = np.concatenate([-edges.sum(axis=2, keepdims=True), edges], axis=2)  # derivative (n, 3, 4) of each b
+    at_origin = np.eye(4)[0] - np.einsum("na,nab->nb", corners[:, 0], by_index)
 
-    def centres_of(tets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def columns_of(tets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Voxels (n, 3) whose centres lie in some of the tetrahedra, and in which (n,)."""
         owner = np.repeat(tets, count[tets])
         step = np.arange(len(owner)) - np.repeat(np.cumsum(count[tets]) - count[tets], count[tets])
-        rest, z = np.divmod(step, size[owner, 2])  # from the step's number in the box of the tetrahedron
-        x, y = np.divmod(rest, size[owner, 1])
-        voxel = low[owner] + np.stack([x, y, z], axis=1)
-        b = np.einsum("na,nab->nb", voxel - corners[owner, 0], to_barycentric[owner])
-        inside = (b >= -ON_A_FACE).all(axis=1) & (b.sum(axis=1) <= 1.0 + ON_A_FACE)
-        return voxel[inside], owner[inside]
+        x, y = np.divmod(step, size[owner, 1]) + low[owner, :2].T  # from the step's number in the tetrahedron's box
+        first, last = low[owner, 2].astype(float), high[owner, 2].astype(float)
+        for b in range(4):
+            below = at_origin[owner, b] + by_index[owner, 0, b] * x + by_index[owner, 1, b] * y + ON_A_FACE
+            slope = by_index[owner, 2, b]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                end = np.where((slope == 0.0) & (below >= 0.0), np.nan, -below / slope)  # none of a side along z
+            np.fmax(first, end, out=first, where=slope >= 0.0)
+            np.fmin(last, end, out=last, where=slope <= 0.0)
+        first, last = np.ceil(first), np.floor(last)
+        met = np.flatnonzero(first <= last)
+        length = (last[met] - first[met]).astype(np.int64) + 1
+        column = np.repeat(met, length)
+        z = np.arange(len(column)) - np.repeat(np.cumsum(length) - length - first[met].astype(np.int64), length)
+        return np.stack([x[column], y[column], z], axis=1), owner[column]
 
-    ends = np.cumsum(count)
-    parts = np.split(np.arange(len(count)), np.searchsorted(ends, np.arange(VOXELS_AT_ONCE, ends[-1], VOXELS_AT_ONCE)))
-    for voxel, owner in mapped(centres_of, parts):
+    total = np.cumsum(count)
+    ends = np.searchsorted(total, np.arange(COLUMNS_AT_ONCE, total[-1], COLUMNS_AT_ONCE))
+    for voxel, owner in mapped(columns_of, np.split(np.arange(len(count)), ends)):
         image[tuple(voxel.T)] = owner
     return image

@@ -56,8 +56,8 @@ def model_surface(result: CaseResult, tissue: int, after: int) -> ModelSurface:
     motion = result.estimation.displacements[after][surface.points]
     fitted = surface.rest + motion
     reach = float(np.linalg.norm(motion, axis=1).max()) + ROOM_MM
-    images = (result.before, result.after[after])
-    before, later = (tissue_distance_map(image, tissue, smoothing_mm=width, reach_mm=reach) for image in images)
+    before = tissue_distance_map(result.before, tissue, smoothing_mm=width, reach_mm=ROOM_MM, far=False)
+    later = tissue_distance_map(result.after[after], tissue, smoothing_mm=width, reach_mm=reach)
     level = before.at(surface.rest)
     # around each point: a third of each of its observed triangles
     size = np.linalg.norm(triangle_normals(surface.rest, surface.triangles), axis=1) * surface.observed
