@@ -302,12 +302,13 @@ class FiniteStrainEquilibrium:
         lacking = -np.asarray(free.T @ self._parameter_forces(stiffness)(directions)) - system.matrix @ known
         return np.asarray(free @ (known + system.solve(lacking, tolerance=LACKING))) + prescribed
 
-    def poisson_tangents(self) -> NDArray[np.float64]:
-        """Columns du / d nu_r (n_dof, n_regions) mm; raises `NotConverged`."""
+    def poisson_tangents(self, *, tolerance: float = TIGHT) -> NDArray[np.float64]:
+        """Columns du / d nu_r (n_dof, n_regions) mm, to a relative residual of `tolerance`; raises `NotConverged`."""
         stiffness = self._stiffness()
         slopes = self.model.moduli_by_poisson(self.moduli, self.coefficients[self.model.constraint.n_modes :])
         loads = -np.asarray(self.balance.free.T @ self.balance.region_forces(self.values, slopes))
-        return np.asarray(self.balance.free @ self._system(stiffness, loads.shape[1]).solve(loads))
+        system = self._system(stiffness, loads.shape[1], tolerance)
+        return np.asarray(self.balance.free @ system.solve(loads, tolerance=tolerance))
 
     def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
         """T^T g (n_regions + n_modes,) for g (n_dof,), by one adjoint solve; raises `NotConverged`."""
@@ -324,16 +325,17 @@ class FiniteStrainEquilibrium:
             raise NotConverged(f"a state out of equilibrium has no derivatives: {self.reason}")
         return self.balance.stiffness(self.values)
 
-    def _many(self, n: int) -> bool:
-        """Whether a new factorisation costs less than to refine n solutions of the old one."""
+    def _many(self, n: int, tolerance: float = TIGHT) -> bool:
+        """Whether a new factorisation costs less than to refine n solutions of the old one to a relative residual."""
         if self.path.factorisation is None:
             return True
-        return not self.path.exact and n * (REFINEMENTS - 1) > FACTORISATION_IN_SOLVES
+        refinements = REFINEMENTS * np.log(tolerance) / np.log(TIGHT)
+        return not self.path.exact and n * (refinements - 1.0) > FACTORISATION_IN_SOLVES
 
-    def _system(self, stiffness: Stiffness, n: int) -> LinearisedSystem:
+    def _system(self, stiffness: Stiffness, n: int, tolerance: float = TIGHT) -> LinearisedSystem:
         """The linear system at this state, ready for n right-hand sides."""
         old = self.path.factorisation
-        ready = self.balance.factorise(stiffness) if old is None or self._many(n) else old
+        ready = self.balance.factorise(stiffness) if old is None or self._many(n, tolerance) else old
         if isinstance(ready, LinearisedSystem):
             ready = ready.nearby
         return LinearisedSystem(self.balance.restricted(stiffness), ready, symmetric=self.balance.symmetric)

@@ -37,6 +37,7 @@ from palpate.uncertainty.profile import PASSES, refitted
 TOLERANCE = 1e-6  # decrement of a minimum
 STEPS = 120  # at the most: a modulus that runs away has far to go
 COARSE = NewtonSettings(tolerance=2e-3, step_tolerance=1e-2)  # of the forces, under another law
+DERIVATIVES = 1e-4  # relative residual of those by Poisson's ratios
 DROPPED = 1e10  # precision of a coefficient that is held at 0: its own is 1
 
 Errors = tuple[NDArray[np.float64], ...]  # changes (n,) mm of each observation's residuals
@@ -128,7 +129,9 @@ def poisson_errors(
     residuals' unit of what depends on the material directly, as a force does.
     """
     tangents = [
-        there.poisson_tangents() if isinstance(there, FiniteStrainEquilibrium) else poisson_tangents(there, dilatation)
+        there.poisson_tangents(tolerance=DERIVATIVES)
+        if isinstance(there, FiniteStrainEquilibrium)
+        else poisson_tangents(there, dilatation)
         for there in equilibria
     ]
     moved = _of_displacements(evaluation, tangents)
