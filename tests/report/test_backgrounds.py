@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
@@ -18,10 +19,12 @@ from palpate.report.slices import first_planes
 from palpate.report.volume import grey_of, whole_box, whole_images
 
 
-@pytest.fixture
-def with_grey(case_result, tmp_path):
+@pytest.fixture(scope="module")
+def with_grey(case_result, tmp_path_factory):
     """The result with grey images of some states: the earlier one of the values 40, the later one of 90."""
+    tmp_path = tmp_path_factory.mktemp("grey")
 
+    @cache
     def given(*, before, after):
         grid = case_result.before.grid
         for name, value in (("before", 40.0), ("after", 90.0)):

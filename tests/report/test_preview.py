@@ -47,12 +47,16 @@ def page_of(checked, **options):
     return preview_page(checked, created="today", version="1", **options)
 
 
+@pytest.fixture(scope="module")
+def page(checked):
+    return page_of(checked)
+
+
 def facts(page):
     return json.loads(re.search(r'id="facts">(.*?)</script>', page, flags=re.DOTALL)[1])
 
 
-def test_it_shows_who_is_who_how_all_lay_and_what_is_held(checked, states):
-    page = page_of(checked)
+def test_it_shows_who_is_who_how_all_lay_and_what_is_held(page, states):
     for tissue in states.before.tissues:
         assert re.search(rf'class="swatch"[^>]*></span>{tissue.name}</th>', page)
     assert states.alignments[0].in_words in page
@@ -62,8 +66,8 @@ def test_it_shows_who_is_who_how_all_lay_and_what_is_held(checked, states):
     assert page.index(GENERATOR) < 2000
 
 
-def test_a_later_image_that_lay_elsewhere_can_be_seen_as_it_lay(checked, states):
-    image = facts(page_of(checked))["preview"][0]
+def test_a_later_image_that_lay_elsewhere_can_be_seen_as_it_lay(page, checked, states):
+    image = facts(page)["preview"][0]
     assert len(image["organs"]) == len(image["whole"]) == 3
     motion = np.array(image["motion"])
     assert motion[:, 3] == pytest.approx(ELSEWHERE.translation, abs=0.5)
@@ -71,8 +75,8 @@ def test_a_later_image_that_lay_elsewhere_can_be_seen_as_it_lay(checked, states)
     assert facts(page_of(dataclasses.replace(checked, states=(still,))))["preview"][0]["motion"] is None
 
 
-def test_arrows_lead_from_middle_to_middle(checked, states):
-    image = facts(page_of(checked))["preview"][0]
+def test_arrows_lead_from_middle_to_middle(page, states):
+    image = facts(page)["preview"][0]
     rectum = next(arrow for arrow in image["arrows"] if arrow["tissue"] == 2)
     assert np.subtract(rectum["end"], rectum["start"]) == pytest.approx(
         states.after[0].middle(2) - states.before.middle(2)
@@ -93,8 +97,7 @@ def test_names_and_sentences_are_escaped(checked, states):
     assert page.count("&lt;img src=x") >= 3
 
 
-def test_it_asks_for_nothing_from_elsewhere(checked):
-    page = page_of(checked)
+def test_it_asks_for_nothing_from_elsewhere(page):
     assert "default-src 'none'" in page
     assert not re.search(r'(?:src|href)="(?!#|data:)', page)
 
