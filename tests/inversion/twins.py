@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import LinearModel, linear_model
 from palpate.mesh.anatomy import Anatomy, Box
 from palpate.mesh.space import lagrange_space
+from palpate.mesh.tet_mesh import TetMesh
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.observation.observed_surface import observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
@@ -53,18 +55,31 @@ class Twin:
 
 def make_twin(*, element="P1", rest_kpa=10.0, voxel_mm=1.5, seed=5, edge_length_mm=6.0, truth=TRUTH) -> Twin:
     """The driver pushes gland and sac; where `rest_kpa` is None, the rest is to be estimated, too."""
+    return deformed(model_of(element, rest_kpa, edge_length_mm), voxel_mm=voxel_mm, seed=seed, truth=truth)
+
+
+@cache
+def model_of(element, rest_kpa, edge_length_mm) -> LinearModel:
+    """Its model, which all motions of one body share."""
+    role = Role.KNOWN if rest_kpa else Role.ESTIMATE
+    mesh = body_mesh(edge_length_mm)
+    rest = replace(mesh.tissues[3], role=role, youngs_modulus_kpa=rest_kpa)
+    space = lagrange_space(replace(mesh, tissues=(*mesh.tissues[:3], rest)), element)
+    motion = prescribed_motion(space, {}, n_modes=12, kernel_mm=12.0, prior_mm=WALL_MM)
+    given = {"modes": motion.modes, "offset": motion.offset, "prescribed": motion.prescribed}
+    return linear_model(space, outer_constraint(space, outer="fixed", **given))
+
+
+@cache
+def body_mesh(edge_length_mm) -> TetMesh:
+    """Its mesh, which takes longer than all else that is made of it."""
     tissues = (
         Tissue("gland", Role.ESTIMATE, (1,)),
         Tissue("sac", Role.ESTIMATE, (2,)),
         Tissue("tube", Role.DRIVER, (3,)),
-        Tissue("rest", Role.KNOWN if rest_kpa else Role.ESTIMATE, (4,), youngs_modulus_kpa=rest_kpa),
+        Tissue("rest", Role.KNOWN, (4,), youngs_modulus_kpa=10.0),
     )
-    mesh = tetrahedralise(Anatomy(tissues, (*BALLS, None), BOX), edge_length_mm=edge_length_mm)
-    space = lagrange_space(mesh, element)
-    motion = prescribed_motion(space, {}, n_modes=12, kernel_mm=12.0, prior_mm=WALL_MM)
-    given = {"modes": motion.modes, "offset": motion.offset, "prescribed": motion.prescribed}
-    model = linear_model(space, outer_constraint(space, outer="fixed", **given))
-    return deformed(model, voxel_mm=voxel_mm, seed=seed, truth=truth)
+    return tetrahedralise(Anatomy(tissues, (*BALLS, None), BOX), edge_length_mm=edge_length_mm)
 
 
 def deformed(model, *, voxel_mm=1.5, seed=5, truth=TRUTH) -> Twin:
