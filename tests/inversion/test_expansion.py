@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -41,12 +42,23 @@ def linear(twins, body, settings):
         return invert(body[1], settings, progress=twins.silent)
 
 
+@pytest.fixture(scope="module")
+def ended(twins, linear, settings):
+    """The estimate where all derivatives are made those of each equilibrium up to so many of them."""
+
+    @cache
+    def with_few(few):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(expansion, "FEW", few)
+            return continue_at_finite_strain(linear, settings, progress=twins.silent)
+
+    return with_few
+
+
 @pytest.fixture(scope="module", params=[0, 1000], ids=["those that decide", "all"])
-def continued(request, twins, linear, settings):
+def continued(request, ended):
     """With the derivatives that decide the moduli made those of each equilibrium, or all of them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(expansion, "FEW", request.param)
-        return continue_at_finite_strain(linear, settings, progress=twins.silent)
+    return ended(request.param)
 
 
 def split(inversion):
@@ -73,12 +85,10 @@ def test_the_derivatives_that_decide_the_moduli_are_those_of_the_equilibrium(bod
     assert np.linalg.norm(stated - exact, axis=0) == pytest.approx(0.0, abs=0.02 * np.linalg.norm(exact))
 
 
-def test_all_derivatives_are_those_of_the_equilibrium_where_they_are_few(linear, settings):
+def test_all_derivatives_are_those_of_the_equilibrium_where_they_are_few(ended):
     """By the directions that decide alone columns of elsewhere remain."""
+    found, few, missed = ended(0), expansion.FEW, []
     with pytest.MonkeyPatch.context() as patch:
-        few, missed = expansion.FEW, []
-        patch.setattr(expansion, "FEW", 0)
-        found = continue_at_finite_strain(linear, settings, progress=lambda _: None)
         unknowns = found.minimum.unknowns + np.array([0.3, -0.2, *np.full(len(found.minimum.unknowns) - 2, 0.1)])
         evaluation = found.objective(unknowns)
         for number in (0, few):
@@ -126,38 +136,39 @@ def test_a_motion_without_equilibrium_ends_the_estimate_where_it_is_the_best_one
         continue_at_finite_strain(linear, settings, progress=twins.silent)
 
 
-@pytest.mark.parametrize(
-    ("failure", "outcome"),
-    [
-        (NotConverged("folded"), Outcome.NO_EQUILIBRIUM),
-        (SolverError("singular"), Outcome.NOT_FOLLOWED),
-        (EstimationError("nothing left to compare"), Outcome.NOT_FOLLOWED),
-    ],
-)
-def test_a_secondary_minimum_that_fails_does_not_end_a_good_estimate(
-    twins, linear, settings, monkeypatch, failure, outcome
-):
-    """It is left out of the comparison, though its linear value is the smaller one, and it is said why."""
+FAILURES = {
+    NotConverged("folded"): Outcome.NO_EQUILIBRIUM,
+    SolverError("singular"): Outcome.NOT_FOLLOWED,
+    EstimationError("nothing left to compare"): Outcome.NOT_FOLLOWED,
+}
+
+
+def test_secondary_minima_that_fail_do_not_end_a_good_estimate(twins, linear, settings, monkeypatch):
+    """They are left out of the comparison, though their linear value is the smaller one, and it is said why."""
     first = linear.candidates[0]
-    away = first.minimum.unknowns + np.append(1.0, np.zeros(len(first.minimum.unknowns) - 1))
-    elsewhere = replace(first.iterate, minimum=replace(first.minimum, unknowns=away))
-    starts = (linear.starts[0], replace(linear.starts[1], candidate=1))
-    both = replace(linear, candidates=(first, estimate.Candidate(elsewhere, first.value - 100.0)), starts=starts)
-    whole = estimate._coarse
+    rest = np.zeros(len(first.minimum.unknowns) - 1)
+    elsewhere = [
+        replace(first.iterate, minimum=replace(first.minimum, unknowns=first.minimum.unknowns + np.append(by, rest)))
+        for by in (1.0, 2.0, -1.0)
+    ]
+    others = tuple(estimate.Candidate(iterate, first.value - 100.0) for iterate in elsewhere)
+    starts = (linear.starts[0], *(replace(linear.starts[1], candidate=k) for k in (1, 2, 3)))
+    whole, failing = estimate._coarse, dict(zip(map(id, elsewhere), FAILURES, strict=True))
 
     def only_the_best(iterate):
-        if iterate is elsewhere:
-            raise failure
+        if id(iterate) in failing:
+            raise failing[id(iterate)]
         return whole(iterate)
 
     monkeypatch.setattr(estimate, "_coarse", only_the_best)
     said = list[str]()
-    found = continue_at_finite_strain(both, settings, progress=said.append)
-    assert any(str(failure) in line for line in said)
+    several = replace(linear, candidates=(first, *others), starts=starts)
+    found = continue_at_finite_strain(several, settings, progress=said.append)
+    assert all(any(str(failure) in line for line in said) for failure in FAILURES)
     assert found.minimum.converged
     assert np.abs(found.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
-    assert [c.minimum.outcome is outcome for c in found.candidates] == [False, True]
-    assert [start.candidate for start in found.starts] == [0, 1]
+    assert [c.minimum.outcome for c in found.candidates[1:]] == list(FAILURES.values())
+    assert [start.candidate for start in found.starts] == [0, 1, 2, 3]
 
 
 def test_starts_that_merge_under_the_law_of_the_case_are_one_candidate(twins, linear, settings):
