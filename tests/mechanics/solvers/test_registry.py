@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from functools import cache
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from palpate.mesh.space import lagrange_space
 AVAILABLE = list(SOLVERS)
 
 
-@pytest.fixture(params=["fixed", "sliding"])
+@pytest.fixture(scope="module", params=["fixed", "sliding"])
 def problem(request, meshes):
     """Matrix of a stiff ball in a soft block, its rigid motions, loads, and its linear displacements."""
     mesh = meshes.box_mesh(
@@ -41,6 +42,12 @@ def problem(request, meshes):
     return matrix, constraint.free.T @ rigid_modes(space.points), loads, linear_displacements(space, constraint)
 
 
+@pytest.fixture(scope="module")
+def ready(problem):
+    """The problem's factorisation by a solver's name."""
+    return cache(lambda solver: factorise(problem[0], solver=solver, near_nullspace=problem[1]))
+
+
 def laplacian(n):
     """A one-dimensional chain held at its first node."""
     matrix = sparse.diags_array([-np.ones(n - 1), 2 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1]).tolil()
@@ -49,17 +56,17 @@ def laplacian(n):
 
 
 @pytest.mark.parametrize("solver", AVAILABLE)
-def test_every_solver_inverts_the_stiffness(problem, solver):
-    matrix, motions, loads, _ = problem
-    solution = factorise(matrix, solver=solver, near_nullspace=motions).solve(matrix @ loads)
+def test_every_solver_inverts_the_stiffness(problem, ready, solver):
+    matrix, _, loads, _ = problem
+    solution = ready(solver).solve(matrix @ loads)
     assert np.linalg.norm(solution - loads) < 1e-7 * np.linalg.norm(loads)
 
 
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9])
 @pytest.mark.parametrize("solver", AVAILABLE)
-def test_a_solution_is_as_exact_as_it_was_asked_for(problem, solver, tolerance):
-    matrix, motions, loads, _ = problem
-    solution = factorise(matrix, solver=solver, near_nullspace=motions).solve(loads, tolerance=tolerance)
+def test_a_solution_is_as_exact_as_it_was_asked_for(problem, ready, solver, tolerance):
+    matrix, _, loads, _ = problem
+    solution = ready(solver).solve(loads, tolerance=tolerance)
     missed = np.linalg.norm(matrix @ solution - loads, axis=0) / np.linalg.norm(loads, axis=0)
     assert missed.max() < 1.01 * tolerance
 
@@ -205,8 +212,8 @@ def test_twin_rows_are_the_unknowns_of_one_node(problem, meshes):
 
 def test_nested_dissection_orders_every_unknown_once_and_spares_fill(problem):
     assert np.array_equal(np.sort(nested_dissection(problem[0])), np.arange(problem[0].shape[0]))
-    half = problem[0].shape[0] // 2  # a factor of all in their natural order takes ten seconds
-    matrix = problem[0][:half][:, :half]
+    part = problem[0].shape[0] // 3  # a factor of all in their natural order takes ten seconds
+    matrix = problem[0][:part][:, :part]
     order = nested_dissection(matrix)
     options = {"permc_spec": "NATURAL", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     natural, dissected = (splu(sparse.csc_matrix(m), **options).L.nnz for m in (matrix, matrix[order][:, order]))
@@ -237,11 +244,13 @@ def test_linear_displacements_are_linear_between_the_corners(meshes):
     assert linear_displacements(lagrange_space(space.mesh, "P1"), constraint) is None
 
 
-def test_multigrid_through_linear_elements_takes_fewer_steps_to_the_same_answer(problem):
+def test_multigrid_through_linear_elements_takes_fewer_steps_to_the_same_answer(problem, ready):
     matrix, motions, loads, coarser = problem
     steps = []
-    for through in (None, coarser):
-        found = factorise(matrix, solver="multigrid", near_nullspace=motions, coarser=through)
+    for found in (
+        ready("multigrid"),
+        factorise(matrix, solver="multigrid", near_nullspace=motions, coarser=coarser),
+    ):
         assert np.allclose(found.solve(matrix @ loads), loads, atol=1e-6 * np.abs(loads).max())
         steps.append(conjugate_gradients(matrix, loads, found.inner.cycle, tolerance=1e-8, max_iterations=200)[1])
     assert steps[1] < steps[0]
