@@ -74,9 +74,9 @@ def whole(line, unknowns):
 @pytest.mark.parametrize("loss", [PowerLaw(), PowerLaw(0.1)], ids=["squares", "robust"])
 def test_the_score_is_that_of_central_differences(twins, twin, point_motion, loss):
     """By points, whose Jacobian is exact; that of surfaces leaves out what slides over voxels."""
-    problem = twins.voxel_problem(twin, twins.deformed(twin.model, seed=6))
+    problem = twins.exact_problem(twin, twins.deformed(twin.model, seed=6))
     points, motion = twin.model.space.points, twin.scene.displacement
-    seen = tuple(point_motion.point_motion(int(n), points[n], motion[n], sd_mm=0.1) for n in range(0, len(points), 11))
+    seen = tuple(point_motion.point_motion(int(n), points[n], motion[n], sd_mm=0.1) for n in range(0, len(points), 23))
     states = tuple(replace(state, observations=seen) for state in problem.states)
     objective = objective_of(replace(problem, states=states), loss=loss)
     objective = replace(objective, parameters=objective.parameters.with_prior(PRIOR_MEAN, PRIOR_SD))

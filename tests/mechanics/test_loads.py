@@ -115,7 +115,7 @@ def test_each_tissue_weighs_by_its_own_density(meshes):
 @pytest.mark.parametrize("following", [True, False])
 def test_with_a_known_load_the_displacement_tells_the_scale(meshes, following):
     """Twice the moduli under twice the load is the same; the modulus columns no longer sum to zero."""
-    space = column(meshes)
+    space = column(meshes, "P1")
     constraint, settings = standing(meshes, space), NewtonSettings(tolerance=1e-12)
     moduli = np.array([8.0, 20.0])
     found = []
@@ -136,7 +136,7 @@ def test_with_a_known_load_the_displacement_tells_the_scale(meshes, following):
 
 def test_the_modulus_of_a_loaded_column_comes_out_in_kilopascals(meshes):
     """Newton on ln E from far off, for the sinking of the top under a known pressure: no tissue's modulus is known."""
-    space = column(meshes)
+    space = column(meshes, "P1")
     load = pressure(space, top(space), 1.5)
     model = finite_strain_model(space, standing(meshes, space), LAWS["neo-hookean"], loads=(load,))
     rows = 3 * np.unique(top(space)) + 2

@@ -88,7 +88,7 @@ def test_the_weights_of_the_limit_attain_it_under_noise_of_its_model(limits, smo
         np.eye(5)[:2] - rows @ now.linearisations[0].jacobian.dense
     )  # what is not seen of the unknowns comes from their prior
     assert kept[:, :2] == pytest.approx(np.zeros((2, 2)), abs=1e-9)  # no bias in the log-moduli
-    fields = (smooth_field(rng, sd_mm=NOISE.sd, correlation_mm=5.0, features=200) for _ in range(400))
+    fields = (smooth_field(rng, sd_mm=NOISE.sd, correlation_mm=5.0, features=100) for _ in range(400))
     draws = [rows @ np.einsum("na,na->n", field.at(places), normals) for field in fields]
     found = np.cov(np.transpose(draws)) + kept[:, 2:] @ np.linalg.solve(now.prior[2:, 2:], kept[:, 2:].T)
     limit = limits.cramer_rao(now, NOISE, 2, cell_mm=5.0)
