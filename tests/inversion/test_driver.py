@@ -116,7 +116,8 @@ def test_the_first_guess_of_the_amplitude_does_not_matter():
     """As long as it is no limit: the amplitude learned here, 5.5 mm, is under twice the smaller guess."""
     motion = drawn(ball(), sd_mm=2.0, kernel_mm=25.0, seed=3)
     first, second = (learned(ball(prior_mm=prior), motion, sd_mm=0.2) for prior in (4.0, 8.0))
-    assert second == pytest.approx(first, rel=0.05, abs=0.02 * np.abs(first).max())
+    allowed = np.maximum(0.05 * np.abs(first), 0.02 * np.abs(first).max())
+    assert np.all(np.abs(second - first) <= allowed)  # 160 000 entries, over which pytest.approx takes two seconds
 
 
 @pytest.mark.parametrize("sd_mm", [0.05, 1.0])
