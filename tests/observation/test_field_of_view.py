@@ -58,7 +58,7 @@ def cropped(whole: Segmentation, low: tuple[int, int, int], high: tuple[int, int
 def space():
     before = image()
     anatomy = anatomy_of(before, box=domain_box([before.grid]), smoothing_mm=0.9)
-    return lagrange_space(tetrahedralise(anatomy, edge_length_mm=9.0), "P1")
+    return lagrange_space(tetrahedralise(anatomy, edge_length_mm=7.5), "P1")
 
 
 def seen(space, *later: Segmentation):

@@ -15,14 +15,17 @@ from palpate.study.case import CaseLoad, Mechanics, MeshBody
 from palpate.study.case_data import CaseData
 
 
-def test_citations_and_sources_belong_together(case_result):
-    text = methods_text(collect(case_result))
+@pytest.fixture(scope="module")
+def text(case_result):
+    return methods_text(collect(case_result))
+
+
+def test_citations_and_sources_belong_together(text):
     cited = [int(n) for group in re.findall(r"\[([\d, ]+)\]", " ".join(text.paragraphs)) for n in group.split(",")]
     assert list(dict.fromkeys(cited)) == list(range(1, len(text.sources) + 1))
 
 
-def test_the_text_says_what_was_set(case_result):
-    text = " ".join(methods_text(collect(case_result)).paragraphs)
+def test_the_text_says_what_was_set(text):
     for words in (
         "prostate and bladder",
         "driven by rectum",
@@ -30,7 +33,7 @@ def test_the_text_says_what_was_set(case_result):
         "quadratic tetrahedra",
         "3 starts",
     ):
-        assert words in text
+        assert words in " ".join(text.paragraphs)
 
 
 def test_the_misfit_is_what_the_observations_say_of_themselves(case_result):
@@ -47,7 +50,7 @@ def test_the_finite_strain_law_is_told_with_its_start(case_result):
         assert ("The linear law gave the start" in text) is told
 
 
-def test_the_prior_of_a_map_is_told_with_its_source(case_result):
+def test_the_prior_of_a_map_is_told_with_its_source(case_result, text):
     for prior, told, cited in (
         ("gaussian", "Gaussian, Matern's kernel", False),
         ("total-variation", "total variation", True),
@@ -55,13 +58,13 @@ def test_the_prior_of_a_map_is_told_with_its_source(case_result):
         first, *others = case_result.case.tissues
         mapped = dataclasses.replace(first, modulus="field", field_prior=prior)
         case = dataclasses.replace(case_result.case, tissues=(mapped, *others))
-        text = methods_text(collect(dataclasses.replace(case_result, case=case)))
+        of_map = methods_text(collect(dataclasses.replace(case_result, case=case)))
         assert f"Inside {first.name} ({told}, sd 0.7 of ln E, length 8 mm) ln E was a field" in " ".join(
-            text.paragraphs
+            of_map.paragraphs
         )
-        assert any("total variation based noise removal" in source for source in text.sources) is cited
-        test_citations_and_sources_belong_together(dataclasses.replace(case_result, case=case))
-    assert "ln E was a field" not in " ".join(methods_text(collect(case_result)).paragraphs)
+        assert any("total variation based noise removal" in source for source in of_map.sources) is cited
+        test_citations_and_sources_belong_together(of_map)
+    assert "ln E was a field" not in " ".join(text.paragraphs)
 
 
 def test_a_known_load_sets_the_scale(case_result):
@@ -102,9 +105,9 @@ def test_a_further_pair_has_a_mesh_that_is_told_of(two_pairs):
     assert "Each of 2 pairs of images had a mesh of its own" in " ".join(methods_text(collect(two_pairs)).paragraphs)
 
 
-def test_the_bibtex_of_palpate_is_that_of_citation_cff(case_result):
+def test_the_bibtex_of_palpate_is_that_of_citation_cff(case_result, text):
     citation = (Path(__file__).parents[2] / "CITATION.cff").read_text()
-    entry = methods_text(collect(case_result)).bibtex.partition("\n\n")[0]
+    entry = text.bibtex.partition("\n\n")[0]
     fields = dict(re.findall(r"^  (\w+) = \{(.*)\},?$", entry, flags=re.MULTILINE))
     stated = dict(re.findall(r'^([\w-]+): "?(.*?)"?$', citation, flags=re.MULTILINE))
     assert entry.startswith("@software{palpate,")
@@ -133,18 +136,17 @@ def test_an_entry_has_balanced_braces_and_its_title(key):
     assert SOURCES[key].title in reference_line(SOURCES[key])
 
 
-def test_every_cited_source_has_its_entry(case_result):
-    text = methods_text(collect(case_result))
+def test_every_cited_source_has_its_entry(text):
     assert len(re.findall("^@", text.bibtex, flags=re.MULTILINE)) == len(text.sources)
 
 
-def test_an_interval_from_the_profile_is_told_of(case_result):
+def test_an_interval_from_the_profile_is_told_of(case_result, text):
     first, second = case_result.estimation.estimates
     leaning = dataclasses.replace(first, interval_kind="profile")
     estimation = dataclasses.replace(case_result.estimation, estimates=(leaning, second))
     told = " ".join(methods_text(collect(dataclasses.replace(case_result, estimation=estimation))).paragraphs)
     assert "of prostate, whose profile likelihood leans to one side" in told
-    assert "leans" not in " ".join(methods_text(collect(case_result)).paragraphs)
+    assert "leans" not in " ".join(text.paragraphs)
 
 
 def test_intervals_are_said_to_cover_what_is_unknown_and_no_error_of_what_is_given(case_result):

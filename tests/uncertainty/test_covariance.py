@@ -130,7 +130,7 @@ def test_the_interval_covers_the_truth_of_repeated_experiments(smooth, rng):
     covariance = sandwich_covariance(objective, now)
     draws = []
     for _ in range(400):
-        motion = smooth_field(rng, sd_mm=SD, correlation_mm=5.0, features=200)
+        motion = smooth_field(rng, sd_mm=SD, correlation_mm=5.0, features=100)
         error = np.einsum("na,na->n", motion.at(places), normals)
         prior = np.concatenate([np.zeros(2), rng.standard_normal(3)])
         score = prior - 200.0 / len(places) * jacobian.T @ error
