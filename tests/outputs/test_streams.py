@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pty
 import shlex
 import shutil
 import subprocess
@@ -25,6 +24,7 @@ def images(tmp_path_factory):
     for name, radius in (("before", 3.0), ("after", 4.0)):
         labels = (np.linalg.norm(places - 8.0, axis=-1) < radius).astype(np.uint8)
         nibabel.save(nibabel.Nifti1Image(labels, np.eye(4)), folder / f"{name}.nii.gz")
+        np.save(folder / f"{name}.npy", labels)
     (folder / "names.json").write_text(json.dumps({"1": "größe 前立腺"}), encoding="utf-8")
     return folder
 
@@ -39,58 +39,95 @@ def init(images: Path, folder: Path, *, flags: str = "", after: str = "", **vari
     )
 
 
-AT_ONCE = """
-import os, sys
-import palpate.cli.entry, palpate.steps.commands, palpate.steps.previewing
+ONE_BY_ONE = """
+import gc, json, os, pty, sys
+import numpy as np
 from palpate.cli import main
+from palpate.images.readers import ImageFormat, StoredImage
+from palpate.images.readers.registry import register
 
 NAMES = ("stdin", "stdout", "stderr")
-children = []
-for number, redirections in enumerate(sys.argv[1:]):
+register(ImageFormat("Numpy", (".npy",), lambda path: StoredImage(np.load(path), np.eye(4))))
+
+def init(number, *flags):
+    images = ["before.npy", "after.npy", "--labels", "names.json"]
+    return main(["init", *images, "--output", str(number), *flags])
+
+def run(number, redirections, flags, encoding):
     reader, gone = os.pipe()
-    os.close(reader)
-    children.append(os.fork())
-    if children[-1]:
-        os.close(gone)
-        continue
+    ours, theirs = pty.openpty()
+    places = {"gone": gone, "tty": theirs, "&1": 1}
     os.dup2(os.open(f"words-{number}", os.O_WRONLY | os.O_CREAT), 1)
     os.dup2(1, 2)
     for redirection in redirections.split():
         file, place = redirection.split(">")
         if place == "&-":
             os.close(int(file))
-        elif place == "gone":
-            os.dup2(gone, int(file))
         else:
-            os.dup2(1 if place == "&1" else os.open(place, os.O_WRONLY), int(file))
+            os.dup2(places[place] if place in places else os.open(place, os.O_RDWR | os.O_CREAT), int(file))
     os.closerange(3, 100)
     for file, name in enumerate(NAMES):
-        stream = None if f"{file}>&-" in redirections else open(file, "w" if file else "r", encoding="utf-8")
+        letters = {"encoding": encoding, "errors": "backslashreplace" if name == "stderr" else "strict"}
+        stream = None if f"{file}>&-" in redirections else open(file, "w" if file else "r", **letters)
         setattr(sys, name, stream)
-    sys.argv = ["palpate", "init", "before.nii.gz", "after.nii.gz", "--labels", "names.json", "--output", str(number)]
-    sys.exit(main())
-print([os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children])
+    sys.exit(init(number, *flags.split()))
+
+init("first", "--quiet")
+gc.collect()
+gc.freeze()  # or each would look through all of it at its end
+codes = []
+for number, command in enumerate(json.loads(sys.argv[1])):
+    child = os.fork()
+    if not child:
+        run(number, *command)
+    codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+print(codes)
 """
+NO_DOCUMENT = {
+    "1>/dev/full 2>err-full": "No space left on device",
+    "1>&- 2>err-closed": "it is closed",
+}
 FAILING = (
     *("1>/dev/full", "2>/dev/full", "1>/dev/full 2>&1", "1>gone 2>&1", "1>gone"),
-    *("1>&-", "2>&-", "1>&- 2>&-", "0>&- 1>&- 2>&-"),
+    *("1>&-", "2>&-", "1>&- 2>&-", "0>&- 1>&- 2>&-", "0>tty 1>tty 2>tty"),
+)
+RUNS = (
+    *((redirections, "", "utf-8") for redirections in FAILING),
+    *((f"1>said-{encoding}", "", encoding) for encoding in ("ascii", "utf-16")),
+    *((f"1>document-{encoding}", "--json", encoding) for encoding in ("ascii", "utf-16")),
+    ("1>gone 2>err-gone", "--json --quiet", "utf-8"),
+    *((redirections, "--json --quiet", "utf-8") for redirections in NO_DOCUMENT),
 )
 
 
-def test_a_stream_that_fails_costs_no_run(images, tmp_path):
-    """Each in a process of its own, of one that has imported what all need; `gone` is a pipe that nobody reads."""
-    shutil.copytree(images, tmp_path, dirs_exist_ok=True)
-    command = [sys.executable, "-c", AT_ONCE, *FAILING]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert (json.loads(done.stdout), done.stderr) == ([0] * len(FAILING), "")
-    for number, redirections in enumerate(FAILING):
-        words = (tmp_path / f"words-{number}").read_text(encoding="utf-8")
-        assert "Traceback" not in words
-        assert "Exception" not in words
-        assert ("case.toml" in words) == ("1>" not in redirections)
-        out = tmp_path / str(number)
-        assert "größe" in (out / "case.toml").read_text(encoding="utf-8")
-        assert sorted(path.name for path in out.iterdir()) == ["case.toml", "preview.html"]
+@pytest.fixture(scope="module")
+def ran(images, tmp_path_factory) -> tuple[Path, list[int]]:
+    """A folder in which `palpate init` ran once with each of RUNS, into the folder of its number; and their codes.
+
+    Each in a process of its own, forked from one that has run once and reads the images itself; `gone` is a pipe that
+    nobody reads, `tty` a terminal that was closed.
+    """
+    folder = tmp_path_factory.mktemp("ran")
+    shutil.copytree(images, folder, dirs_exist_ok=True)
+    command = [sys.executable, "-c", ONE_BY_ONE, json.dumps(RUNS)]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    return folder, json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("number", range(len(RUNS)))
+def test_a_stream_that_fails_costs_no_run(ran, number):
+    """All files are written, whatever a stream does."""
+    folder, codes = ran
+    redirections, _, encoding = RUNS[number]
+    assert codes[number] == (6 if redirections in NO_DOCUMENT else 0)
+    words = (folder / f"words-{number}").read_text(encoding=encoding)
+    assert "Traceback" not in words
+    assert "Exception" not in words
+    assert ("case.toml" in words) == ("1>" not in redirections)
+    out = folder / str(number)
+    assert "größe" in (out / "case.toml").read_text(encoding="utf-8")
+    assert sorted(path.name for path in out.iterdir()) == ["case.toml", "preview.html"]
 
 
 @pytest.mark.parametrize("after", ["2>&1 | head -0", "<&- >&- 2>&-"])
@@ -100,41 +137,26 @@ def test_a_stream_that_fails_from_the_start_costs_no_run(images, tmp_path, after
     assert (tmp_path / "out" / "case.toml").exists()
 
 
-def test_a_terminal_that_is_closed_costs_no_run(images, tmp_path):
-    ours, theirs = pty.openpty()
-    command = [PALPATE, "init", "before.nii.gz", "after.nii.gz", "--output", str(tmp_path / "out")]
-    process = subprocess.Popen(command, cwd=images, stdout=theirs, stderr=theirs, stdin=theirs)
-    os.close(theirs)
-    os.close(ours)
-    assert process.wait(60) == 0
-    assert (tmp_path / "out" / "case.toml").exists()
-
-
 @pytest.mark.parametrize("encoding", ["ascii", "utf-16"])
-def test_letters_that_a_stream_lacks_are_escaped(images, tmp_path, encoding):
-    done = init(images, tmp_path / "text", PYTHONIOENCODING=encoding, after="| cat -v")
-    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
-    with (tmp_path / "document").open("wb") as file:
-        command = f"{PALPATE} init before.nii.gz after.nii.gz --labels names.json --output {tmp_path / 'json'} --json"
-        variables = os.environ | {"PYTHONIOENCODING": encoding}
-        subprocess.run(shlex.split(command), cwd=images, stdout=file, env=variables, check=True)
-    document = json.loads((tmp_path / "document").read_bytes().decode(encoding))
+def test_letters_that_a_stream_lacks_are_escaped(ran, encoding):
+    folder, _ = ran
+    said = (folder / f"said-{encoding}").read_bytes().decode(encoding)
+    assert ("größe 前立腺" if encoding == "utf-16" else r"gr\xf6\xdfe \u524d\u7acb\u817a") in said
+    document = json.loads((folder / f"document-{encoding}").read_bytes().decode(encoding))
     assert "größe 前立腺" in [tissue["tissue"] for tissue in document["tissues"]]
 
 
-def test_a_document_whose_reader_has_left_is_no_failure(images, tmp_path):
-    done = init(images, tmp_path / "out", flags="--json --quiet", after="| true")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert (tmp_path / "out" / "case.toml").exists()
+def test_a_document_whose_reader_has_left_is_no_failure(ran):
+    folder, _ = ran
+    assert (folder / "err-gone").read_text() == ""
 
 
-@pytest.mark.parametrize(("after", "reason"), [(">/dev/full", "No space left on device"), (">&-", "it is closed")])
-def test_a_document_that_cannot_be_written_ends_with_6_after_all_else_is_done(images, tmp_path, after, reason):
-    done = init(images, tmp_path / "out", flags="--json --quiet", after=after)
-    assert done.returncode == 6
-    (line,) = done.stderr.strip().splitlines()
+@pytest.mark.parametrize("redirections", NO_DOCUMENT)
+def test_a_document_that_cannot_be_written_is_told_after_all_else_is_done(ran, redirections):
+    folder, _ = ran
+    (line,) = (folder / redirections.split("2>")[1]).read_text(encoding="utf-8").strip().splitlines()
+    reason = NO_DOCUMENT[redirections]
     assert f"could not be written to standard output ({reason}); what the run had to write is whole in" in line
-    assert (tmp_path / "out" / "case.toml").exists()
 
 
 @pytest.mark.parametrize(
