@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+import zlib
 from pathlib import Path
 
 import nibabel
@@ -116,11 +117,11 @@ def layers(*masks: np.ndarray) -> bytes:
 
 
 def bomb(folder: Path) -> None:
-    content = gzip.decompress((folder / "after.nii.gz").read_bytes())
-    with gzip.open(folder / "after.nii.gz", "wb", 1) as file:
-        file.write(content)
-        for _ in range(64):
-            file.write(bytes(2**24))  # a gigabyte of zeros
+    packer = zlib.compressobj(1, wbits=31)  # a gzip stream
+    content = packer.compress(gzip.decompress((folder / "after.nii.gz").read_bytes()))
+    content += packer.flush(zlib.Z_FULL_FLUSH)
+    zeros = packer.compress(bytes(2**24)) + packer.flush(zlib.Z_FULL_FLUSH)  # which refer to nothing before them
+    (folder / "after.nii.gz").write_bytes(content + 64 * zeros + packer.flush())  # a gigabyte
 
 
 def overlapping(folder: Path) -> None:
