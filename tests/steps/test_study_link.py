@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 
 from palpate.cli import main
@@ -24,10 +26,16 @@ class Study:
         return keys | {"estimates": self.estimates, "variations": variations, "warnings": []}
 
 
+@pytest.fixture(scope="module")
+def saved(case_result, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("saved")
+    saving.save_estimate(case_result, OutputFolder(folder))
+    return folder
+
+
 @pytest.fixture
-def folder(case_result, tmp_path):
-    saving.save_estimate(case_result, OutputFolder(tmp_path))
-    return tmp_path
+def folder(saved, tmp_path):
+    return shutil.copytree(saved, tmp_path, dirs_exist_ok=True)
 
 
 def study_of(folder, **changes):
