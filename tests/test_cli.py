@@ -172,9 +172,11 @@ def test_with_json_stdout_is_result_json_and_nothing_else(tmp_path, when_read, c
 
 
 @pytest.mark.usefixtures("runner")
-def test_quiet_leaves_nothing_but_errors(case_file, tmp_path, capfd):
+def test_quiet_leaves_nothing_but_errors_and_the_log_is_let_go_of(case_file, tmp_path, capfd):
     assert main(["estimate", str(case_file), "--output", str(tmp_path), "--quiet"]) == 0
     assert capfd.readouterr() == ("", "")
+    handlers = logging.getLogger("palpate").handlers
+    assert not [handler for handler in handlers if isinstance(handler, logging.StreamHandler)]
 
 
 @pytest.mark.parametrize(
@@ -300,13 +302,6 @@ def test_the_demo_is_written_like_an_estimate(tmp_path, monkeypatch, case_result
     assert "The later state is simulated." in out
     assert "60.0" in out  # the truth beside the estimate
     assert (tmp_path / "report.html").exists()
-
-
-@pytest.mark.usefixtures("runner")
-def test_the_log_is_let_go_of(case_file, tmp_path):
-    main(["estimate", str(case_file), "--output", str(tmp_path), "--quiet"])
-    handlers = logging.getLogger("palpate").handlers
-    assert not [handler for handler in handlers if isinstance(handler, logging.StreamHandler)]
 
 
 @pytest.mark.parametrize("arguments", [[], ["estimat"], ["estimate"], ["simulate", "x.toml", "--steps", "0"]])

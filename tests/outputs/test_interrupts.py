@@ -86,10 +86,9 @@ def test_a_signal_after_the_last_word_changes_nothing(signal):
 
 
 def test_what_the_process_was_told_to_ignore_it_ignores():
-    done = script(IMPORTS.replace("sys.meta_path", "signal.signal(signal.SIGHUP, signal.SIG_IGN)\nsys.meta_path"),
-                  module="numpy", signal="SIGHUP")  # fmt: skip
-    assert done.returncode == 2
-    assert "nowhere.toml" in done.stdout + done.stderr
+    ignoring = IMPORTS.replace("sys.meta_path", "signal.signal(signal.SIGHUP, signal.SIG_IGN)\nsys.meta_path")
+    done = script(ignoring.replace('"check", "nowhere.toml"', '"--version"'), module="argparse", signal="SIGHUP")
+    assert (done.returncode, done.stdout.split()[0]) == (0, "palpate")
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are told of in /proc")
