@@ -148,8 +148,8 @@ def dicom_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_no_identifier_of_dicom_is_in_any_output(
     dicom_folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    assert all(planted_in(path) for path in dicom_folder.rglob("*.dcm"))
     """Of the image that its files are read into, whose way through an estimate is that of the headers below."""
+    assert all(planted_in(path) for path in dicom_folder.rglob("*.dcm"))
     output = tmp_path / "out"
     assert main(["mesh", str(dicom_folder / "case.toml"), "--output", str(output)]) == 0
     images = [str(dicom_folder / name) for name in ("before.dcm", "after.dcm")]

@@ -112,3 +112,13 @@ def test_check_makes_the_mesh_of_the_estimate_and_predicts_its_cost(case_result,
 def test_check_says_the_same_twice(on_disk):
     first, second = (check_case(on_disk, [], progress=silent).to_dict() for _ in range(2))
     assert first == second
+
+
+def test_a_domain_may_end_within_voxels(case_result):
+    """Voxels that it cuts count by their share: else layers of what is around organs are wrong."""
+    case = with_edge(case_result.case, 4.0)
+    box = dataclasses.replace(case.domain, extent="margin", margin_mm=3.45)
+    found = mesh_reference(
+        case_result.before, case_result.after, dataclasses.replace(case, domain=box), progress=silent
+    )
+    assert abs(found.quality.voxel_volume_error["surroundings"]) < 0.01
