@@ -96,11 +96,8 @@ class Expansion:
 
     def at_equilibrium(self, at: LinearisationPoint, *, tolerance: float) -> Expansion:
         """The expansion around the equilibrium at a place near by, to a tolerance of the forces; `NotConverged`."""
-        return self._solved(self.equilibrium.model.to_tolerance(tolerance), at)
-
-    def _solved(self, model: FiniteStrainModel, at: LinearisationPoint) -> Expansion:
-        """The expansion around a model's equilibrium at a place near by; `NotConverged`."""
-        start, nearby = self.model.solve(at.moduli, at.coefficients).displacement, self.factorisation
+        model, nearby = self.equilibrium.model.to_tolerance(tolerance), self.factorisation
+        start = self.model.solve(at.moduli, at.coefficients).displacement
         return self._around(from_start(model, at.moduli, at.coefficients, start=start, nearby=nearby))
 
     def _equilibrium(self, at: LinearisationPoint) -> FiniteStrainEquilibrium:

@@ -111,7 +111,9 @@ class ReducedBasis:
             displacement = displacement + late.sum(axis=1)
             sharper = replace(_extended(sharper, missing, cost), place=at)
         if stale:
-            return _with_material_anew(sharper, displacement)
+            responses = sharper.system.material_responses(displacement, tolerance=TANGENT)
+            counts = sharper.counts + SolveCounts(tangent=model.material.n_modes)
+            return replace(sharper, counts=counts).with_material(responses)
         return _with_sharper_material(sharper, at, displacement, solved)
 
     @property
@@ -195,13 +197,6 @@ def basis_of(system: LinearSystem, responses: NDArray[np.float64], counts: Solve
     """A system's model on displacements (n_dof, k) mm that are there, with what they, and the system, cost."""
     snapshots = np.asarray(system.model.constraint.free.T @ responses)
     return ReducedBasis(projection(system.model, snapshots), system, counts)
-
-
-def _with_material_anew(basis: ReducedBasis, displacement: NDArray[np.float64]) -> ReducedBasis:
-    """All responses to the material modes at the factorised moduli and a displacement (n_dof,) mm there."""
-    responses = basis.system.material_responses(displacement, tolerance=TANGENT)
-    counts = basis.counts + SolveCounts(tangent=basis.full_model.material.n_modes)
-    return replace(basis, counts=counts).with_material(responses)
 
 
 def _with_sharper_material(

@@ -260,7 +260,7 @@ def _linear(
         belongs[groups[number]], spent = len(ends), spent + end.minimum.evaluations
         ends.append(end)
     same = _groups([end.minimum for end in ends], n)
-    totals = [_total(end) for end in ends]
+    totals = [e.objective.total(e.minimum.evaluation) if e.minimum.converged else np.inf for e in ends]
     best = [min(_members(same, g), key=lambda i: totals[i]) for g in range(max(same) + 1)]
     order = sorted(best, key=lambda i: totals[i])
     followed = list[OuterIterate]()
@@ -306,13 +306,6 @@ def _screened(first: OuterIterate, settings: InversionSettings, progress: Progre
 def _members(groups: Sequence[int], group: int) -> list[int]:
     """Numbers of those that belong to a group."""
     return [i for i, of in enumerate(groups) if of == group]
-
-
-def _total(iterate: OuterIterate) -> float:
-    """The objective where an iterate ended; infinite where that is no minimum."""
-    if not iterate.minimum.converged:
-        return np.inf
-    return iterate.objective.total(iterate.minimum.evaluation)
 
 
 def _coarse(linear: OuterIterate) -> tuple[Objective, list[FiniteStrainEquilibrium]]:
@@ -364,7 +357,7 @@ def _concluded(
     groups = _groups([iterate.minimum for iterate in followed], n)
     distinct = []
     for group in range(max(groups) + 1):  # stood for by the one sought first, else one that converged
-        members = [i for i, of in enumerate(groups) if of == group]
+        members = _members(groups, group)
         distinct.append(followed[min(members, key=lambda i: (i != first, not followed[i].minimum.converged, i))])
     values, evaluations = _values(distinct, bounds)
     candidates = tuple(Candidate(iterate, value) for iterate, value in zip(distinct, values, strict=True))

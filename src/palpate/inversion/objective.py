@@ -222,7 +222,7 @@ class Objective:
         total, _ = _prior(self.parameters, unknowns)
         for s in range(len(self.states)):
             pairs = self._residuals(s, self._equilibrium(s, unknowns).values, unknowns)
-            total += sum(mapped(lambda of: _misfit(*of), pairs))
+            total += sum(mapped(lambda of: 0.5 * of[0].weighting.precision * _mean_loss(*of), pairs))
         return total
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
@@ -238,8 +238,9 @@ class Objective:
         for line in lines:
             score[line.columns] += line.score
             matrix[np.ix_(line.columns, line.columns)] += line.information
-            misfit += _mean_loss(line.observation, line.residuals) / len(lines)
-            value += _misfit(line.observation, line.residuals)
+            loss = _mean_loss(line.observation, line.residuals)
+            misfit += loss / len(lines)
+            value += 0.5 * line.precision * loss
         return Evaluation(value, misfit, score, matrix, tuple(lines), prior, pull)
 
     def rematched(self, unknowns: NDArray[np.float64]) -> Objective:
@@ -267,7 +268,8 @@ class Objective:
         self, s: int, values: NDArray[np.float64], unknowns: NDArray[np.float64]
     ) -> list[tuple[Observation, Residuals]]:
         """Each observation of a state with its residuals at displacements (n_observed,) mm and its offset."""
-        material = self._material(s, unknowns)
+        moduli, coefficients = self.parameters.moduli(unknowns), self.parameters.coefficients(unknowns)[s]
+        material = moduli, coefficients[self.states[s].model.constraint.n_modes :]
 
         def seen(of: tuple[tuple[Observation, NDArray[np.float64]], float]) -> tuple[Observation, Residuals]:
             """One observation with its residuals."""
@@ -276,11 +278,6 @@ class Objective:
             return observation, here.residuals(motion, offset)
 
         return mapped(seen, zip(self._seen(s, values), self._offsets(s, unknowns), strict=True))
-
-    def _material(self, s: int, unknowns: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Moduli (n_regions,) kPa and coefficients (n_material,) of the material of a state."""
-        n_boundary = self.states[s].model.constraint.n_modes
-        return self.parameters.moduli(unknowns), self.parameters.coefficients(unknowns)[s][n_boundary:]
 
     def _by_material(self, s: int, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives (n_regions + n_material, k) of ln E and the material of a state by theta and coefficients."""
@@ -372,11 +369,6 @@ def log_det(matrix: NDArray[np.float64]) -> float:
     """Ln det of a positive definite matrix (n, n), without the unknowns that nothing depends on."""
     seen = np.diag(matrix) > 0.0
     return float(np.linalg.slogdet(matrix[np.ix_(seen, seen)])[1]) if seen.any() else 0.0
-
-
-def _misfit(observation: Observation, residuals: Residuals) -> float:
-    """What an observation adds to the objective, dimensionless."""
-    return 0.5 * observation.weighting.precision * _mean_loss(observation, residuals)
 
 
 def _mean_loss(observation: Observation, residuals: Residuals) -> float:

@@ -157,11 +157,13 @@ def gauss_newton(
         if not np.isfinite(now.value):
             outcome = Outcome.NOT_FINITE
             break
-        free = _free(objective, unknowns, now, bounds, fixed)
+        theta, slope = unknowns[:n], now.score[:n]  # a log-modulus at a bound that pulls outwards stays
+        still = ((theta <= bounds.lower) & (slope > 0.0)) | ((theta >= bounds.upper) & (slope < 0.0)) | fixed
+        free = np.concatenate([~still, np.ones(len(unknowns) - n, dtype=bool)])
         quadratic = _QuadraticModel.of(now, free, n)
         whole = quadratic.step()
         decrement = -0.5 * float(now.score @ whole)
-        history.append(Iterate(unknowns[:n], now.value, now.misfit_mm2, decrement))
+        history.append(Iterate(theta, now.value, now.misfit_mm2, decrement))
         if decrement < tolerance and np.all(np.abs(whole[:n]) < within):
             outcome = Outcome.CONVERGED
             break
@@ -204,20 +206,6 @@ def _search(
             return (trial, there, region.after(float(gain / promised), longest)), trials + 1, True
         region = region.smaller(longest)
     return None, TRIALS, solved
-
-
-def _free(
-    objective: LeastSquares,
-    unknowns: NDArray[np.float64],
-    now: Evaluation,
-    bounds: Bounds,
-    fixed: NDArray[np.bool_] | bool,
-) -> NDArray[np.bool_]:
-    """Unknowns that may move: not a log-modulus at a bound that pulls outwards, nor a fixed one."""
-    n = objective.n_parameters
-    theta, slope = unknowns[:n], now.score[:n]
-    still = ((theta <= bounds.lower) & (slope > 0.0)) | ((theta >= bounds.upper) & (slope < 0.0)) | fixed
-    return np.concatenate([~still, np.ones(len(unknowns) - n, dtype=bool)])
 
 
 def newton_decrement(now: Evaluation) -> float:

@@ -246,11 +246,12 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     within = 0.05 * rule.tolerance(at, n)
     found = gauss_newton(linear, at.unknowns, bounds=near, fixed=fixed, tolerance=INNER, within=within)
     found = found if not damping else replace(found, evaluation=replace(linear, damping=0.0)(found.unknowns))
-    cut = damping > 0.0 or (not fixed and _cut_short(found.unknowns[:n], near, bounds))
-    if damping or not rule.learn:
-        ends = objective.total(at.evaluation), objective.total(found.evaluation)
-        return _Step(objective, found, at.evaluation, *ends, cut, settled=False)
+    theta = found.unknowns[:n]
+    low, high = (theta <= near.lower) & (near.lower > bounds.lower), (theta >= near.upper) & (near.upper < bounds.upper)
+    cut = damping > 0.0 or (not fixed and bool(np.any(low | high)))
     now, total = objective.total(at.evaluation), objective.total(found.evaluation)
+    if damping or not rule.learn:
+        return _Step(objective, found, at.evaluation, now, total, cut, settled=False)
     settled = not cut and bool(np.all(np.abs(found.unknowns - at.unknowns)[:n] < posterior_sd(found, n)))
     if rule.correlate and settled and start.correlated < SETTLES:
         objective = with_correlations(objective, found.evaluation)
@@ -272,12 +273,6 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     return _Step(objective, found, begin, now, total, cut, settled)
 
 
-def _cut_short(theta: NDArray[np.float64], near: Bounds, bounds: Bounds) -> bool:
-    """Whether the trust region, and no bound of the search, holds a log-modulus back."""
-    low, high = (theta <= near.lower) & (near.lower > bounds.lower), (theta >= near.upper) & (near.upper < bounds.upper)
-    return bool(np.any(low | high))
-
-
 def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIterate, Evaluation, int]:
     """The objective at the end of a step, its model made exact there where its error matters.
 
@@ -293,7 +288,8 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
         size = max(size, 1.0)  # the trust region holds back what the noise of the objective does not hide
     wanted = size
     if np.isfinite(rule.coefficients):
-        decrement = newton_decrement_of(now.minimum, unknowns)
+        step_taken = unknowns - now.minimum.unknowns
+        decrement = 0.5 * float(step_taken @ now.minimum.evaluation.matrix @ step_taken)
         wanted = max(0.0 if np.isinf(rule.step_sd) else size, decrement / (rule.coefficients * len(unknowns)))
     correlated = now.correlated + step.settled
     if np.isinf(rule.model_error):
@@ -310,12 +306,6 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
     there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals)
     return replace(there, correlated=correlated), judged, spent
-
-
-def newton_decrement_of(before: Minimum, unknowns: NDArray[np.float64]) -> float:
-    """Half of the squared length of a step from a minimum to unknowns (n,), by the Gauss-Newton matrix there."""
-    step = unknowns - before.unknowns
-    return 0.5 * float(step @ before.evaluation.matrix @ step)
 
 
 def _linearisation(objective: Objective, there: Minimum) -> NDArray[np.float64]:

@@ -118,8 +118,9 @@ def covariance_of(
     """All that is known of the log-moduli's errors at unknowns (n_unknowns,).
 
     The sandwich, what is considered or undecided, the mesh, and what the scatter over grid positions, by the `errors`
-    there, adds (see `grid_covariance`); nothing of no errors. noise_of: the residuals' noise where it is not that of
-    the evaluation (see `error_noise`), whose residuals hold what wrong moduli leave.
+    there, adds (see `grid_covariance`); nothing of no errors. A block has the part H^-1 P_b H^-1 of the prior's.
+    noise_of: the residuals' noise where it is not that of the evaluation (see `error_noise`), whose residuals hold what
+    wrong moduli leave.
     """
     noise_of = error_noise(evaluation) if noise_of is None else noise_of
     mesh = mesh_covariance(objective)
@@ -137,26 +138,15 @@ def covariance_of(
     further = [_considered(objective, evaluation, rows), undecided_covariance(objective, evaluation, unknowns)]
     prior = prior + sum((part for of in further for part in of.values()), np.zeros_like(prior))
     left = noise + prior + grid if given is evaluation else sum(parts(given), np.zeros_like(noise))
-    return Covariance(noise, prior, grid, mesh, _causes(objective, evaluation, further), left + mesh)
-
-
-def _causes(
-    objective: Objective, evaluation: Evaluation, further: Sequence[Mapping[str, NDArray[np.float64]]]
-) -> dict[str, NDArray[np.float64]]:
-    """The parts H^-1 P_b H^-1 of the prior's covariance (n_parameters, n_parameters), by the cause of the blocks.
-
-    With the `further` parts of each.
-    """
-    inverse, found = evaluation.covariance_columns(objective.n_parameters), dict[str, NDArray[np.float64]]()
+    inverse, causes = rows.T, dict[str, NDArray[np.float64]]()
     for cause, part in (item for of in further for item in of.items()):
-        found[cause] = found.get(cause, np.zeros_like(part)) + part
+        causes[cause] = causes.get(cause, np.zeros_like(part)) + part
     for i, block in enumerate(objective.parameters.blocks):
-        if block.released:  # its share is that of `with_released`
-            continue
-        own = objective.parameters.columns(i)
-        part = inverse[own].T @ evaluation.prior[np.ix_(own, own)] @ inverse[own]
-        found[block.cause] = found.get(block.cause, np.zeros_like(part)) + part
-    return found
+        if not block.released:  # its share is that of `with_released`
+            own = objective.parameters.columns(i)
+            part = inverse[own].T @ evaluation.prior[np.ix_(own, own)] @ inverse[own]
+            causes[block.cause] = causes.get(block.cause, np.zeros_like(part)) + part
+    return Covariance(noise, prior, grid, mesh, causes, left + mesh)
 
 
 def _considered(
@@ -273,7 +263,10 @@ def noise_covariance(
             for key in dict.fromkeys(groups):
                 group = [pair for pair, own in zip(of_kind, groups, strict=True) if own == key]
                 noise = mean_noise([noise_of[line.state, kind] for line, _ in group])
-                data += 0.5 * _propagated(noise, group, at_rest=at_rest)
+                carried = np.concatenate([row for _, row in group], axis=1)
+                residuals = [line.residuals for line, _ in group]
+                places = np.concatenate([r.material if at_rest else r.places for r in residuals])
+                data += 0.5 * noise.covariance(carried, places, np.concatenate([r.normals for r in residuals]))
     return data
 
 
@@ -286,38 +279,23 @@ def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
     lines, n, found = evaluation.linearisations, len(evaluation.matrix), {}
     inverse = evaluation.covariance_columns(n)
     for key, (own, telling) in of_one_noise(evaluation).items():
+        jacobians, gains = list[Jacobian](), list[Jacobian]()
+        for line in (lines[i] for i in telling):
+            tangent = np.zeros((len(line.jacobian.tangent), n))
+            tangent[:, line.columns] = line.jacobian.tangent
+            jacobians.append(replace(line.jacobian, tangent=tangent))
+        for line in (lines[i] for i in own):  # W J H^-1, its part of the gain's transpose
+            weights = sparse.diags_array(line.precision * line.weights)
+            seen = sparse.csr_matrix(weights @ line.jacobian.by_displacement)
+            gains.append(Jacobian(seen, line.jacobian.tangent @ inverse[line.columns]))
         response = FitResponse(
-            jacobians=[_among_all(lines[i], n) for i in telling],
-            gains=[_gains(lines[i], inverse) for i in own],
+            jacobians,
+            gains,
             places=[lines[i].residuals.places for i in own],
             normals=[lines[i].residuals.normals for i in own],
         )
         found[key] = lines[own[0]].observation.fitted_noise([lines[i].residuals for i in telling], response)
     return found
-
-
-def _among_all(line: Linearisation, n_unknowns: int) -> Jacobian:
-    """An observation's Jacobian (n, n_unknowns) by all unknowns."""
-    tangent = np.zeros((len(line.jacobian.tangent), n_unknowns))
-    tangent[:, line.columns] = line.jacobian.tangent
-    return replace(line.jacobian, tangent=tangent)
-
-
-def _gains(line: Linearisation, inverse: NDArray[np.float64]) -> Jacobian:
-    """W J H^-1 (n, n_unknowns), an observation's part of the gain's transpose, with H^-1 (n_unknowns, n_unknowns)."""
-    weights = sparse.diags_array(line.precision * line.weights)
-    seen = sparse.csr_matrix(weights @ line.jacobian.by_displacement)
-    return Jacobian(seen, line.jacobian.tangent @ inverse[line.columns])
-
-
-def _propagated(
-    noise: NoiseModel, group: Sequence[tuple[Linearisation, NDArray[np.float64]]], *, at_rest: bool
-) -> NDArray[np.float64]:
-    """G C G^T (n_parameters, n_parameters) of observations with their gains G, C between their places."""
-    carried = np.concatenate([row for _, row in group], axis=1)
-    residuals = [line.residuals for line, _ in group]
-    places = np.concatenate([r.material if at_rest else r.places for r in residuals])
-    return noise.covariance(carried, places, np.concatenate([r.normals for r in residuals]))
 
 
 def grid_position_shifts(
@@ -410,16 +388,12 @@ def imaging_errors(
             rest[reference] = _imaged(fitted.space, np.zeros_like(fitted.displacement), fitted.before, material, rng)
         places = [line.residuals.places for line in lines]
         after = _imaged(fitted.space, fitted.displacement, fitted.after, places, rng)
-        errors += [_imaging_error(line, rest[reference], after) for line in lines]
+        for line in lines:
+            seen, error = line.observation, np.zeros(len(line.weights))  # none of what no segmented image shows
+            if isinstance(seen, Imaged):
+                error = seen.imaging_error(line.residuals, rest[reference], after)
+            errors.append(error)
     return errors
-
-
-def _imaging_error(line: Linearisation, before: Segmentation, after: Segmentation) -> NDArray[np.float64]:
-    """Errors (n,) mm of one observation's residuals; none of what no segmented image shows."""
-    seen = line.observation
-    return (
-        seen.imaging_error(line.residuals, before, after) if isinstance(seen, Imaged) else np.zeros(len(line.weights))
-    )
 
 
 def _imaged(

@@ -147,10 +147,11 @@ def _joint_covariance(
     considered = np.zeros((mapping.n_unknowns, n * n_pairs))  # J_b^T W J H_s^-1 e_i
     shifts, mesh = list[NDArray[np.float64]](), np.zeros((n_pairs, n, n_pairs, n))
     references = [state.reference for state in objective.states]
+    states = [s for s, state in enumerate(objective.states) for _ in state.observations]  # of each observation
     for s, evaluation in enumerate(of.evaluation for of in alone):
         of_data = evaluation.matrix - evaluation.prior
         considered[mapping.alone(s)[1], s * n : (s + 1) * n] = of_data @ evaluation.covariance_columns(n)
-        seen = [i for i, line in enumerate(_lines(objective)) if line == s]
+        seen = [i for i, state in enumerate(states) if state == s]
         shifts.append(shifts_by(evaluation, [[draw[i] for i in seen] for draw in errors], n))
         of_mesh = mesh_covariance(replace(objective, states=(objective.states[s],)))
         for t in range(n_pairs):
@@ -163,11 +164,6 @@ def _joint_covariance(
     itself = np.kron(np.eye(n_pairs), np.ones((n, n)))
     grid = scatter(np.concatenate(shifts, axis=1)) * (BETWEEN_GRIDS + (1.0 - BETWEEN_GRIDS) * itself)
     return np.asarray((total + grid_covariance(alone[0].evaluation, grid, noise)).reshape(mesh.shape) + mesh)
-
-
-def _lines(objective: Objective) -> list[int]:
-    """The number of each observation's state, in their order."""
-    return [s for s, state in enumerate(objective.states) for _ in state.observations]
 
 
 def agreement(pairs: PairEstimates) -> Agreement:
@@ -187,7 +183,12 @@ def agreement(pairs: PairEstimates) -> Agreement:
     every, kept = np.ones(n_pairs, dtype=bool), np.ones(n_pairs, dtype=bool)
     limit = special.chdtri(n, OUTLIER / n_pairs)
     while kept.sum() >= LEAST_PAIRS:
-        distances = np.array([_distance(theta, joint, kept, p) if kept[p] else 0.0 for p in range(n_pairs)])
+        distances = np.zeros(n_pairs)
+        for p in np.flatnonzero(kept).tolist():
+            away = -_mean(joint, kept & _without(p, n_pairs))[0]
+            away[:, p * n : (p + 1) * n] += np.eye(n)
+            off = away @ theta
+            distances[p] = off @ np.linalg.solve(away @ joint @ away.T, off)
         if distances.max() <= limit:
             break
         kept[int(distances.argmax())] = False
@@ -196,7 +197,11 @@ def agreement(pairs: PairEstimates) -> Agreement:
     weights, spread = _mean(joint, every)
     without = [_mean(joint, every & _without(p, n_pairs))[0] @ theta for p in range(n_pairs)]
     good = pairs.of(kept, n)
-    between = _between(good)
+    between = np.zeros(n)
+    for i in range(n):  # Q of one modulus has the mean n_pairs - 1 + variance tr P
+        about = _about_the_mean(good.covariance[:, i, :, i], np.ones((len(good.theta), 1)))
+        q = float(good.theta[:, i] @ about @ good.theta[:, i])
+        between[i] = max((q - (len(good.theta) - 1)) / float(np.trace(about)), 0.0)
     about = _about_the_mean(good.covariance.reshape(good.theta.size, -1), np.tile(np.eye(n), (len(good.theta), 1)))
     q = float(good.theta.ravel() @ about @ good.theta.ravel())
     robust, covariance = _mean(joint + np.diag(np.tile(between, n_pairs)), kept)
@@ -236,28 +241,5 @@ def _about_the_mean(joint: NDArray[np.float64], design: NDArray[np.float64]) -> 
     return np.asarray(np.linalg.inv(joint) - pulled @ np.linalg.solve(design.T @ pulled, pulled.T))
 
 
-def _distance(theta: NDArray[np.float64], joint: NDArray[np.float64], kept: NDArray[np.bool_], pair: int) -> float:
-    """Squared Mahalanobis distance of a pair from the mean of the others that are kept."""
-    away = -_mean(joint, kept & _without(pair, len(kept)))[0]
-    n = len(away)
-    away[:, pair * n : (pair + 1) * n] += np.eye(n)
-    off = away @ theta
-    return float(off @ np.linalg.solve(away @ joint @ away.T, off))
-
-
 def _without(pair: int, n_pairs: int) -> NDArray[np.bool_]:
     return np.asarray(np.arange(n_pairs) != pair)
-
-
-def _between(pairs: PairEstimates) -> NDArray[np.float64]:
-    """Variance (n,) between pairs of each log-modulus, by the method of moments; none below zero.
-
-    Q = t^T P t of one modulus, P = V^-1 - V^-1 1 1^T V^-1 / 1^T V^-1 1, has the mean n_pairs - 1 + variance tr P.
-    """
-    n_pairs, n = pairs.theta.shape
-    found = np.zeros(n)
-    for i in range(n):
-        about = _about_the_mean(pairs.covariance[:, i, :, i], np.ones((n_pairs, 1)))
-        q = float(pairs.theta[:, i] @ about @ pairs.theta[:, i])
-        found[i] = max((q - (n_pairs - 1)) / float(np.trace(about)), 0.0)
-    return found

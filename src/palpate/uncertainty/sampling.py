@@ -60,9 +60,16 @@ def posterior_chains(
     Steps are made in y of what acts on moduli in series with the rest of a region (see `in_series`), not in its x: the
     log-moduli that go with it lie on a curve in x, and nearly on a line in y.
     """
-    n, straight = frozen.objective.n_parameters, _Straight.of(frozen)
-    laplace = _laplace(straight, start, evaluation)
-    start = laplace.centre
+    n, parameters = frozen.objective.n_parameters, frozen.objective.parameters
+    straight = _Straight(frozen, parameters.acting_on_moduli, parameters.shares_on_moduli)
+    slopes, start = straight.slopes(start), straight.straightened(start)
+    try:
+        laplace = _Laplace(start, linalg.cholesky(evaluation.matrix / np.outer(slopes, slopes), lower=True))
+    except linalg.LinAlgError as error:
+        raise EstimationError(
+            f"the Gauss-Newton matrix is not positive definite ({error}): some modulus moves nothing at this place, so"
+            " its posterior cannot be sampled; start at a minimum"
+        ) from error
     with determined():
         own = np.linalg.cholesky(evaluation.covariance_columns(n)[:n])
         stretch = np.asarray(np.linalg.cholesky(covariance) @ np.linalg.inv(own), dtype=np.float64)
@@ -94,11 +101,6 @@ class _Straight:
     columns: NDArray[np.int64]
     shares: NDArray[np.float64]
 
-    @classmethod
-    def of(cls, frozen: FrozenPosterior) -> _Straight:
-        parameters = frozen.objective.parameters
-        return cls(frozen, parameters.acting_on_moduli, parameters.shares_on_moduli)
-
     def slopes(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives dz / dx (n_unknowns,) at unknowns x (n_unknowns,)."""
         found = np.ones(len(unknowns))
@@ -119,18 +121,6 @@ class _Straight:
             return np.inf, np.inf
         value = self.frozen.value(unknowns)
         return value + float(np.log(self.slopes(unknowns)[self.columns]).sum()), value
-
-
-def _laplace(straight: _Straight, start: NDArray[np.float64], evaluation: Evaluation) -> _Laplace:
-    slopes = straight.slopes(start)
-    try:
-        factor = linalg.cholesky(evaluation.matrix / np.outer(slopes, slopes), lower=True)
-        return _Laplace(straight.straightened(start), factor)
-    except linalg.LinAlgError as error:
-        raise EstimationError(
-            f"the Gauss-Newton matrix is not positive definite ({error}): some modulus moves nothing at this place, so"
-            " its posterior cannot be sampled; start at a minimum"
-        ) from error
 
 
 @dataclass(frozen=True, slots=True)

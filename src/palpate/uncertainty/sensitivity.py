@@ -134,19 +134,16 @@ def poisson_errors(
         else poisson_tangents(there, dilatation)
         for there in equilibria
     ]
-    moved = _of_displacements(evaluation, tangents)
-    return tuple(
-        e + _by_poisson(line, equilibria[line.state]) for line, e in zip(evaluation.linearisations, moved, strict=True)
-    )
-
-
-def _by_poisson(line: Linearisation, there: LinearEquilibrium | FiniteStrainEquilibrium) -> NDArray[np.float64] | float:
-    """Derivatives (n, n_regions) of an observation's residuals by Poisson's ratios at a held displacement."""
-    seen, system = line.observation, there if isinstance(there, FiniteStrainEquilibrium) else there.system
-    if not isinstance(seen, OfMaterial):
-        return 0.0
-    material = there.coefficients[system.model.constraint.n_modes :]
-    return seen.under(system.moduli, material).by_poisson(seen_by(seen, there.values))
+    found = []
+    for line, moved in zip(evaluation.linearisations, _of_displacements(evaluation, tangents), strict=True):
+        seen, there = line.observation, equilibria[line.state]
+        if not isinstance(seen, OfMaterial):
+            found.append(moved)
+            continue
+        system = there if isinstance(there, FiniteStrainEquilibrium) else there.system
+        here = seen.under(system.moduli, there.coefficients[system.model.constraint.n_modes :])
+        found.append(moved + here.by_poisson(seen_by(seen, there.values)))
+    return tuple(found)
 
 
 def law_errors(
@@ -160,7 +157,26 @@ def law_errors(
     Newton's method leads from each equilibrium to that of the other law, with the factorisation that is there. Raises
     `NotConverged` where there is none.
     """
-    return _of_displacements(evaluation, [_under_law(there, law, dilatation) for there in equilibria])
+    changes = []
+    for there in equilibria:
+        if isinstance(there, FiniteStrainEquilibrium):
+            exact = there if there.factorisation else there.refactorised()
+            other = replace(exact.model, elements=elements_of(exact.model.space, law, dilatation))
+            moduli, factorisation = exact.moduli, exact.factorisation
+        else:
+            model, moduli, factorisation = there.system.model, there.system.moduli, there.system.factorisation
+            other = finite_strain_model(
+                model.space,
+                model.constraint,
+                law,
+                dilatation=dilatation,
+                loads=model.conditions.loads,
+                material=model.material,
+            )
+        coarse = replace(other, settings=COARSE)
+        found = coarse.solve(moduli, there.coefficients, start=there.displacement, nearby=factorisation)
+        changes.append(np.asarray(found.values - there.values))
+    return _of_displacements(evaluation, changes)
 
 
 def _of_displacements(evaluation: Evaluation, changes: Sequence[NDArray[np.float64]]) -> Errors:
@@ -169,30 +185,6 @@ def _of_displacements(evaluation: Evaluation, changes: Sequence[NDArray[np.float
         np.asarray(line.residuals.jacobian @ seen_by(line.observation, changes[line.state]))
         for line in evaluation.linearisations
     )
-
-
-def _under_law(
-    there: LinearEquilibrium | FiniteStrainEquilibrium, law: Law, dilatation: Dilatation
-) -> NDArray[np.float64]:
-    """By how much (n_dof,) mm a body moves further under another law."""
-    if isinstance(there, FiniteStrainEquilibrium):
-        exact = there if there.factorisation else there.refactorised()
-        other = replace(exact.model, elements=elements_of(exact.model.space, law, dilatation))
-        moduli, factorisation = exact.moduli, exact.factorisation
-    else:
-        model, moduli, factorisation = there.system.model, there.system.moduli, there.system.factorisation
-        other = finite_strain_model(
-            model.space,
-            model.constraint,
-            law,
-            dilatation=dilatation,
-            loads=model.conditions.loads,
-            material=model.material,
-        )
-    found = replace(other, settings=COARSE).solve(
-        moduli, there.coefficients, start=there.displacement, nearby=factorisation
-    )
-    return np.asarray(found.values - there.values)
 
 
 def modulus_errors(objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation) -> Errors:

@@ -15,7 +15,7 @@ from palpate.mechanics.material import field_modes
 from palpate.mesh.tet_mesh import FACES, TetMesh
 from palpate.uncertainty.covariance import covariance_among
 from palpate.uncertainty.intervals import NORMAL_95, Interval
-from palpate.unknowns import FIELD, Acts, Block, TotalVariation
+from palpate.unknowns import FIELD, Acts, TotalVariation
 
 CONTRAST = 1.5  # from which a part of a tissue is another stiffness, and not its own scatter
 CERTAIN, LIKELY = 0.95, 0.5  # posterior probability of that: somewhere in a region that is reported, all over it
@@ -149,46 +149,49 @@ def stiffness_maps(inversion: Inversion, variances: NDArray[np.float64]) -> tupl
     sandwich with what is considered, that of what the images do not see the prior's (Spantini et al. 2015, SIAM J. Sci.
     Comput. 37, A2451, Theorem 2.3).
     """
-    blocks = inversion.objective.parameters.blocks
-    return tuple(_map(inversion, i, block, variances) for i, block in enumerate(blocks) if block.cause == FIELD)
-
-
-def _map(inversion: Inversion, number: int, block: Block, variances: NDArray[np.float64]) -> StiffnessMap:
-    objective, minimum = inversion.objective, inversion.minimum
-    parameters, state = objective.parameters, block.states[0]
-    model = objective.states[state].model
-    mesh, own = model.space.mesh, parameters.columns(number)
-    tissue = next(i for i, t in enumerate(mesh.tissues) if t.name == block.of and t.field)
-    elements = np.flatnonzero(mesh.region == tissue)
-    first = int(np.searchsorted(parameters.acting(Acts.MATERIAL, state), own[0]))
-    seen = model.material.fields[elements][:, first : first + block.size].toarray()
-    theta, n = parameters.tissues.index(block.of), parameters.n_parameters
-    covariance = covariance_among(objective, minimum.evaluation, np.array([theta, *own]))
-    learned = np.asarray(np.linalg.inv(parameters.nuisance_precision[np.ix_(own - n, own - n)]), dtype=np.float64)
-    stated = mesh.tissues[tissue].field
-    assert stated is not None
-    amplitude = 1.0 if block.variation else float(np.sqrt(np.trace(learned) / np.trace(np.linalg.inv(block.precision))))
-    sd = amplitude * stated.sd
-    modes, volumes = field_modes(mesh, tissue, length_mm=stated.length_mm), mesh.volumes[elements]
-    left = sd**2 * np.maximum(1.0 - (modes**2).sum(axis=1), 0.0)
-    every = sd * (modes - (volumes @ modes) / volumes.sum())
-    if block.variation:  # all of its modes are unknowns
-        every = np.asarray(seen @ np.linalg.cholesky(learned))
-    centre = parameters.prior_centre[own]
-    field = _Field(minimum.unknowns[own], centre, seen, covariance[1:, 1:], learned, every, left, block.variation)
-    whole = field.variance + variances[theta] + 2.0 * seen @ covariance[1:, 0]
-    resolution = np.clip(1.0 - field.variance / field.prior_variance, 0.0, 1.0)
-    return StiffnessMap(
-        block.of,
-        state,
-        elements,
-        field.mean,
-        np.sqrt(np.maximum(whole, 0.0)),
-        resolution,
-        sd,
-        float(np.average(resolution, weights=volumes)),
-        _region(mesh, elements, field),
-    )
+    objective, minimum, maps = inversion.objective, inversion.minimum, list[StiffnessMap]()
+    parameters = objective.parameters
+    for number, block in enumerate(parameters.blocks):
+        if block.cause != FIELD:
+            continue
+        state, own = block.states[0], parameters.columns(number)
+        model = objective.states[state].model
+        mesh = model.space.mesh
+        tissue = next(i for i, t in enumerate(mesh.tissues) if t.name == block.of and t.field)
+        elements = np.flatnonzero(mesh.region == tissue)
+        first = int(np.searchsorted(parameters.acting(Acts.MATERIAL, state), own[0]))
+        seen = model.material.fields[elements][:, first : first + block.size].toarray()
+        theta, n = parameters.tissues.index(block.of), parameters.n_parameters
+        covariance = covariance_among(objective, minimum.evaluation, np.array([theta, *own]))
+        learned = np.asarray(np.linalg.inv(parameters.nuisance_precision[np.ix_(own - n, own - n)]), dtype=np.float64)
+        stated = mesh.tissues[tissue].field
+        assert stated is not None
+        sd = stated.sd
+        if not block.variation:
+            sd *= float(np.sqrt(np.trace(learned) / np.trace(np.linalg.inv(block.precision))))
+        modes, volumes = field_modes(mesh, tissue, length_mm=stated.length_mm), mesh.volumes[elements]
+        left = sd**2 * np.maximum(1.0 - (modes**2).sum(axis=1), 0.0)
+        every = sd * (modes - (volumes @ modes) / volumes.sum())
+        if block.variation:  # all of its modes are unknowns
+            every = np.asarray(seen @ np.linalg.cholesky(learned))
+        centre = parameters.prior_centre[own]
+        field = _Field(minimum.unknowns[own], centre, seen, covariance[1:, 1:], learned, every, left, block.variation)
+        whole = field.variance + variances[theta] + 2.0 * seen @ covariance[1:, 0]
+        resolution = np.clip(1.0 - field.variance / field.prior_variance, 0.0, 1.0)
+        maps.append(
+            StiffnessMap(
+                block.of,
+                state,
+                elements,
+                field.mean,
+                np.sqrt(np.maximum(whole, 0.0)),
+                resolution,
+                sd,
+                float(np.average(resolution, weights=volumes)),
+                _region(mesh, elements, field),
+            )
+        )
+    return tuple(maps)
 
 
 def _region(mesh: TetMesh, elements: NDArray[np.int64], field: _Field) -> DifferentRegion | None:
@@ -197,7 +200,11 @@ def _region(mesh: TetMesh, elements: NDArray[np.int64], field: _Field) -> Differ
     for sign in (1.0, -1.0):
         probability = ndtr((sign * field.mean - np.log(CONTRAST)) / sd)
         likely = np.flatnonzero(probability > LIKELY)
-        _, part = connected_components(_neighbours(mesh.tets[elements[likely]]))
+        faces = np.sort(mesh.tets[elements[likely]][:, FACES].reshape(-1, 3), axis=1)
+        _, face = np.unique(faces, axis=0, return_inverse=True)
+        owner = np.repeat(np.arange(len(likely)), len(FACES))
+        of_face = sparse.csr_matrix((np.ones(len(owner)), (owner, face.ravel())), shape=(len(likely), len(faces)))
+        _, part = connected_components(of_face @ of_face.T)  # joined through faces
         for label in np.unique(part[probability[likely] > CERTAIN]):
             found.append(_different(mesh, elements, field, likely[part == label], probability))
     return max(found, key=lambda region: region.volume_ml, default=None)
@@ -226,12 +233,3 @@ def _different(
         float(probability[inside].max()),
         field.variation is not None,
     )
-
-
-def _neighbours(tets: NDArray[np.int64]) -> sparse.csr_matrix[np.float64]:
-    """Which of the tetrahedra (n, 4) share a face, (n, n)."""
-    faces = np.sort(tets[:, FACES].reshape(-1, 3), axis=1)
-    _, face = np.unique(faces, axis=0, return_inverse=True)
-    owner = np.repeat(np.arange(len(tets)), len(FACES))
-    of_face = sparse.csr_matrix((np.ones(len(owner)), (owner, face.ravel())), shape=(len(tets), len(faces)))
-    return sparse.csr_matrix(of_face @ of_face.T)
