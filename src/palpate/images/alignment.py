@@ -276,11 +276,22 @@ def _about_centroids(turn: NDArray[np.float64], source: _Moments, target: _Momen
 
 
 def _descend(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
-    """Gauss-Newton with Tukey weights; a step that does not lower the cost at the weights' scale is halved."""
+    """Gauss-Newton with Tukey weights, among the turns that the surface shows.
+
+    A step, (6,) turn (rad) and shift (mm), that does not lower the cost at the weights' scale is halved.
+    """
     state = _state(motion, matches)
     for _ in range(MAX_STEPS):
         scale = _scale(state)
-        step, cost = _step(state, scale), _cost(state, scale)
+        weight = state.area * tukey(state.residual, TUKEY * scale)
+        shown, _ = _shown(state, weight)
+        basis = np.zeros((6, shown.shape[1] + 3))
+        basis[:3, :-3], basis[3:, -3:] = shown / state.radius, np.eye(3)
+        reduced = state.jacobian @ basis
+        normal = (reduced * weight[:, None]).T @ reduced
+        slope = reduced.T @ (weight * state.residual)
+        step = np.asarray(-basis @ np.linalg.pinv(normal, rcond=1e-6, hermitian=True) @ slope)
+        cost = _cost(state, scale)
         for _ in range(6):
             turn = Rotation.from_rotvec(step[:3]).as_matrix()
             by_step = RigidMotion(turn, state.centre - turn @ state.centre + step[3:])
@@ -353,15 +364,3 @@ def _shown(state: _State, weight: NDArray[np.float64]) -> tuple[NDArray[np.float
     coupling = normal[:3, 3:] @ np.linalg.pinv(normal[3:, 3:], rcond=1e-6, hermitian=True) @ normal[3:, :3]
     values, axes = np.linalg.eigh(normal[:3, :3] - coupling)
     return axes[:, values > UNDETERMINED], axes[:, values <= UNDETERMINED]
-
-
-def _step(state: _State, scale: float) -> NDArray[np.float64]:
-    """Turn (rad) and shift (mm), (6,), of one Gauss-Newton step among the turns that the surface shows."""
-    weight = state.area * tukey(state.residual, TUKEY * scale)
-    shown, _ = _shown(state, weight)
-    basis = np.zeros((6, shown.shape[1] + 3))
-    basis[:3, :-3], basis[3:, -3:] = shown / state.radius, np.eye(3)
-    reduced = state.jacobian @ basis
-    normal = (reduced * weight[:, None]).T @ reduced
-    slope = reduced.T @ (weight * state.residual)
-    return np.asarray(-basis @ np.linalg.pinv(normal, rcond=1e-6, hermitian=True) @ slope)

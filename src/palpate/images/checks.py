@@ -248,7 +248,7 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
 
     The agreement is the mean over the organs of the share of voxels that find their own organ; the organs' common
     centroids are laid on each other, so neither a shift nor the size of the field of view matters. Where exchanging the
-    labels of two organs makes them agree as well, that is told instead.
+    labels of two organs makes them agree much better, and by as much as a mirror does, that is told instead.
     """
     points = []  # of each organ at most MIRROR_SAMPLES voxel centres (n, 3), evenly picked, RAS mm
     for i in observed:
@@ -269,7 +269,16 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
         agreement[signs] = float(np.trace(found)) / len(observed)
     plain = agreement.pop((1.0, 1.0, 1.0))
     signs, best = max(agreement.items(), key=lambda item: (round(item[1], 3), sum(item[0])))
-    _refuse_exchanged(found, [before.tissues[i].name for i in observed], name, at_least=len(observed) * (best - plain))
+    own = np.diag(found)
+    gain = found + found.T - own[:, None] - own
+    i, j = sorted(divmod(int(np.argmax(gain)), len(observed)))
+    if gain[i, j] >= max(2.0 * MIRROR_CERTAIN, len(observed) * (best - plain)):
+        one, other = (before.tissues[observed[k]].name for k in (i, j))
+        now, then = (own[i] + own[j]) / 2.0, (found[i, j] + found[j, i]) / 2.0
+        raise InputDataError(
+            f"'{one}' and '{other}' look exchanged in '{name}': {then:.0%} of their voxels lie in the other"
+            f" organ there, {now:.0%} in their own; check which label is which in that image"
+        )
     if best - plain < MIRROR_LIKELY:
         return []
     axes = " and ".join(direction for direction, sign in zip(DIRECTIONS, signs, strict=True) if sign < 0.0)
@@ -280,23 +289,6 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
     if best - plain >= MIRROR_CERTAIN:
         raise InputDataError(text)
     return [Finding("mirrored", text, place=f"'{name}'")]
-
-
-def _refuse_exchanged(found: NDArray[np.float64], organs: Sequence[str], name: str, *, at_least: float) -> None:
-    """Raise `InputDataError` when two organs' voxels agree much better with their labels exchanged in the later image.
-
-    found (n, n): the share of each of the `organs` that finds each of them there; at_least: the gain in the sum of
-    agreements that another explanation has.
-    """
-    own = np.diag(found)
-    gain = found + found.T - own[:, None] - own
-    i, j = sorted(divmod(int(np.argmax(gain)), len(organs)))
-    if gain[i, j] >= max(2.0 * MIRROR_CERTAIN, at_least):
-        now, then = (own[i] + own[j]) / 2.0, (found[i, j] + found[j, i]) / 2.0
-        raise InputDataError(
-            f"'{organs[i]}' and '{organs[j]}' look exchanged in '{name}': {then:.0%} of their voxels lie in the other"
-            f" organ there, {now:.0%} in their own; check which label is which in that image"
-        )
 
 
 def _shifts(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:

@@ -108,14 +108,24 @@ def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
     It counts where it makes the images e^5 times as probable as no motion. Raises `InputDataError` when the images
     share too few surface points.
     """
-    surfaces, middles = _surfaces(before, maps)
+    surfaces, middles = list[_Shown](), list[tuple[NDArray[np.float64], NDArray[np.float64]]]()  # (3,) mm in both
+    for tissue, pair in maps.items():
+        first, second = (seen_surface(one) for one in pair)
+        if min(len(first.area), len(second.area)) < LEAST_POINTS:
+            continue
+        step = -(-len(first.area) // MOST_POINTS)
+        places, normals = first.places[::step], first.normals[::step]
+        alike = np.exp(-0.5 * cdist(places, places, "sqeuclidean") / LENGTH_MM**2) * (normals @ normals.T)
+        own = OWN_MOTION_MM[before.tissues[tissue].role] ** 2 * alike
+        surfaces.append(_Shown(places, pair[0].at(places), pair[1], own))
+        middles.append((first.area @ first.places / first.area.sum(), second.area @ second.places / second.area.sum()))
     if not surfaces:
         raise InputDataError(
             "no tissue shows enough of its surface in both images, away from their borders, for a motion between them"
             " to be measured; enlarge the images, or set align = 'none'"
         )
-    centre = np.average([first for first, _ in middles], axis=0)
-    shift = np.median([second - first for first, second in middles], axis=0)
+    centre = np.average([here for here, _ in middles], axis=0)
+    shift = np.median([there - here for here, there in middles], axis=0)
     still = _trial(surfaces, centre, np.zeros(6))
     starts = [still, _trial(surfaces, centre, np.concatenate([np.zeros(3), shift]))]
     found = [_descended(surfaces, centre, start) for start in starts if start.n_seen >= LEAST_POINTS]
@@ -144,24 +154,6 @@ def residuals_by_tissue(before: Segmentation, maps: SurfaceMaps, motion: RigidMo
             distance = second.at(motion.apply(places)) - first.at(places)
             found[before.tissues[tissue].name] = float(np.sqrt(np.mean(distance**2)))
     return found
-
-
-def _surfaces(
-    before: Segmentation, maps: SurfaceMaps
-) -> tuple[list[_Shown], list[tuple[NDArray[np.float64], NDArray[np.float64]]]]:
-    """The surfaces that are seen, and the middles (3,) mm of each in both images."""
-    surfaces, middles = [], []
-    for tissue, pair in maps.items():
-        first, second = (seen_surface(one) for one in pair)
-        if min(len(first.area), len(second.area)) < LEAST_POINTS:
-            continue
-        step = -(-len(first.area) // MOST_POINTS)
-        places, normals = first.places[::step], first.normals[::step]
-        alike = np.exp(-0.5 * cdist(places, places, "sqeuclidean") / LENGTH_MM**2) * (normals @ normals.T)
-        own = OWN_MOTION_MM[before.tissues[tissue].role] ** 2 * alike
-        surfaces.append(_Shown(places, pair[0].at(places), pair[1], own))
-        middles.append((first.area @ first.places / first.area.sum(), second.area @ second.places / second.area.sum()))
-    return surfaces, middles
 
 
 def _trial(surfaces: Sequence[_Shown], centre: NDArray[np.float64], parameters: NDArray[np.float64]) -> _Trial:

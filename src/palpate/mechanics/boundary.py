@@ -40,24 +40,23 @@ def outer_constraint(
     _check_prescription(space, modes, offset, prescribed)
     cut, behind = cut_faces(space.mesh), [tissue.role is Role.SLIDING for tissue in space.mesh.tissues]
     named = space.mesh.boundary[np.isin(space.mesh.beyond, np.flatnonzero(behind))]
-    held = _held_normals(space, np.concatenate([named, cut]) if outer == "sliding" else named)
+    sliding = np.concatenate([named, cut]) if outer == "sliding" else named
+    normals = triangle_normals(space.mesh.nodes, sliding)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    dyads, held = np.einsum("fi,fj->fij", normals, normals), np.zeros((len(space.points), 3, 3))
+    for column in space.facets(sliding).T:  # the sum of n (x) n over the unit normals n of the faces at each point
+        np.add.at(held, column, dyads)
     if outer in ("fixed", "moving"):
         held[np.unique(space.facets(cut))] = np.eye(3)
     held[prescribed] = np.eye(3)
-    free = _free_directions(held)
+    values, vectors = np.linalg.eigh(held)  # point by point free are the directions with no part in `held`
+    point, direction = np.nonzero(values <= SAME_PLANE * np.maximum(values[:, -1:], np.finfo(float).tiny))
+    columns, rows = np.repeat(np.arange(len(point)), 3), (3 * point[:, None] + np.arange(3)).ravel()
+    entries, shape = (vectors[point, :, direction].ravel(), (rows, columns)), (3 * len(held), len(point))
+    free: sparse.csr_matrix[np.float64] = sparse.csr_matrix(entries, shape=shape)
+    free.eliminate_zeros()
     refuse_floating(space, free)
     return Constraint(free=free, modes=np.array(modes, dtype=float), offset=np.array(offset, dtype=float))
-
-
-def _held_normals(space: LagrangeSpace, triangles: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The sum (n_points, 3, 3) of n (x) n over the unit normals n of the triangles (n_faces, 3) at each point."""
-    normals = triangle_normals(space.mesh.nodes, triangles)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    dyads = np.einsum("fi,fj->fij", normals, normals)
-    held = np.zeros((len(space.points), 3, 3))
-    for column in space.facets(triangles).T:
-        np.add.at(held, column, dyads)
-    return held
 
 
 def _check_prescription(
@@ -76,16 +75,3 @@ def _check_prescription(
             f"modes or offset move {int(stray.sum())} points that are not prescribed (the first is number"
             f" {int(np.flatnonzero(stray)[0])}): mark them in `prescribed` or set their rows to zero"
         )
-
-
-def _free_directions(held: NDArray[np.float64]) -> sparse.csr_matrix[np.float64]:
-    """Orthonormal columns (n_dof, n_free) that span, point by point, the directions with no part in `held`."""
-    n = len(held)
-    values, vectors = np.linalg.eigh(held)
-    free = values <= SAME_PLANE * np.maximum(values[:, -1:], np.finfo(float).tiny)
-    point, direction = np.nonzero(free)
-    columns = np.repeat(np.arange(len(point)), 3)
-    rows = (3 * point[:, None] + np.arange(3)).ravel()
-    matrix = sparse.csr_matrix((vectors[point, :, direction].ravel(), (rows, columns)), shape=(3 * n, len(point)))
-    matrix.eliminate_zeros()
-    return matrix

@@ -153,8 +153,8 @@ def follow(
 
 
 def _step(way: _Way, path: NewtonPath, length: float) -> NewtonPath:
-    """Predictor, shortened if need be, and corrections."""
-    balance, fraction = way.balance, path.fraction
+    """Predictor, shortened if need be, and Newton's iterations until the residual is below the tolerance."""
+    balance, settings, fraction = way.balance, way.settings, path.fraction
     residual, _ = way.residual(path.displacement, fraction + length)
     stiffness = balance.stiffness(path.displacement, path.pressure)
     load = residual + length * np.asarray(balance.free.T @ (stiffness @ way.increment))
@@ -164,8 +164,25 @@ def _step(way: _Way, path: NewtonPath, length: float) -> NewtonPath:
     share = _bearable(way, path, change)
     ahead = min(1.0, fraction + share * length)
     ahead = 1.0 if 1.0 - ahead < 1e-12 else ahead
-    path = path.moved(balance, change, share)
-    return _correct(way, replace(path, fraction=ahead, steps=path.steps + 1))
+    path = replace(path.moved(balance, change, share), fraction=ahead, steps=path.steps + 1)
+    tolerance = _tolerance(way, ahead)
+    residual, size = way.residual(path.displacement, ahead)
+    for _ in range(settings.max_iterations):
+        path = replace(path, force=max(path.force, size))
+        norm = float(np.linalg.norm(residual))
+        if norm <= tolerance * path.force:
+            return path
+        # As far as the next residual will be from zero anyway, and no further than the tolerance asks for.
+        forcing = max(float(np.clip(norm / path.force, *FORCING)), 0.3 * tolerance * path.force / norm)
+        stiffness = balance.stiffness(path.displacement, path.pressure)
+        free, path = _solved(way, path, stiffness, -residual, forcing)
+        path, residual, size = _search(way, path, residual, np.asarray(balance.free @ free))
+    share = float(np.linalg.norm(residual)) / path.force
+    raise _StepFailed(
+        f"{settings.max_iterations} Newton iterations left out-of-balance forces of {share:.1g} of the internal ones,"
+        f" with {balance.weakest(path.displacement)} the worst",
+        path,
+    )
 
 
 def _bearable(way: _Way, path: NewtonPath, change: Array) -> float:
@@ -181,29 +198,6 @@ def _bearable(way: _Way, path: NewtonPath, change: Array) -> float:
 def _tolerance(way: _Way, fraction: float) -> float:
     """The final tolerance at the end of the way, the one between steps before it."""
     return way.settings.tolerance if fraction == 1.0 else way.settings.step_tolerance
-
-
-def _correct(way: _Way, path: NewtonPath) -> NewtonPath:
-    """Newton's iterations at the path's fraction until the residual is below the tolerance."""
-    settings = way.settings
-    tolerance = _tolerance(way, path.fraction)
-    residual, size = way.residual(path.displacement, path.fraction)
-    for _ in range(settings.max_iterations):
-        path = replace(path, force=max(path.force, size))
-        norm = float(np.linalg.norm(residual))
-        if norm <= tolerance * path.force:
-            return path
-        # As far as the next residual will be from zero anyway, and no further than the tolerance asks for.
-        forcing = max(float(np.clip(norm / path.force, *FORCING)), 0.3 * tolerance * path.force / norm)
-        stiffness = way.balance.stiffness(path.displacement, path.pressure)
-        free, path = _solved(way, path, stiffness, -residual, forcing)
-        path, residual, size = _search(way, path, residual, np.asarray(way.balance.free @ free))
-    share = float(np.linalg.norm(residual)) / path.force
-    raise _StepFailed(
-        f"{settings.max_iterations} Newton iterations left out-of-balance forces of {share:.1g} of the internal ones,"
-        f" with {way.balance.weakest(path.displacement)} the worst",
-        path,
-    )
 
 
 def _solved(way: _Way, path: NewtonPath, stiffness: Stiffness, load: Array, forcing: float) -> tuple[Array, NewtonPath]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse
+from scipy import linalg
 
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.forward import DenseEquilibrium, Outputs, checked_coefficients, checked_moduli
@@ -203,9 +203,16 @@ class Projection:
 
         Only what the snapshots add is multiplied with the stiffness. Raises `ConfigurationError` for other rows.
         """
-        fresh = self._complement(_checked(self.model, snapshots))
-        if not fresh.shape[1]:
+        snapshots = _checked(self.model, snapshots)
+        lengths = np.linalg.norm(snapshots, axis=0)
+        rest = snapshots[:, lengths > 0.0] / lengths[lengths > 0.0]
+        for _ in range(2):  # once leaves the rounding of what it takes away
+            rest = rest - self.spanned(self.components(rest))
+        rest = rest[:, np.linalg.norm(rest, axis=0) > RANK_TOLERANCE]
+        if not rest.shape[1]:
             return self
+        fresh = orthonormal_basis(rest)
+        fresh = orthonormal_basis(fresh - self.spanned(self.components(fresh)))
         model, old, blocks = self.model, self.reduced, []
         for matrix, block in zip(model.free_stiffness, old.stiffness, strict=True):
             image = times(matrix, fresh)
@@ -224,18 +231,6 @@ class Projection:
         """The projection with responses du/dc_k (n_dof, n_material) mm to the material modes."""
         return replace(self, reduced=replace(self.reduced, output_material=responses))
 
-    def _complement(self, snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Orthonormal columns (n_free, m) that span what the snapshots (n_free, k) add to the present vectors."""
-        lengths = np.linalg.norm(snapshots, axis=0)
-        rest = snapshots[:, lengths > 0.0] / lengths[lengths > 0.0]
-        for _ in range(2):  # once leaves the rounding of what it takes away
-            rest = rest - self.spanned(self.components(rest))
-        rest = rest[:, np.linalg.norm(rest, axis=0) > RANK_TOLERANCE]
-        if not rest.shape[1]:
-            return np.asarray(rest)
-        fresh = orthonormal_basis(rest)
-        return orthonormal_basis(fresh - self.spanned(self.components(fresh)))
-
 
 def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection:
     """Project `model` on the span of `snapshots` (n_free, k), free coordinates F^T u of displacements u, mm.
@@ -243,7 +238,14 @@ def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection
     They are made orthonormal and their rank cut; raises `ConfigurationError` when their rows are not n_free.
     """
     vectors = orthonormal_basis(_checked(model, snapshots))
-    stiffness = np.stack([_products(matrix, vectors) for matrix in model.free_stiffness])
+    stiffness = np.empty((len(model.free_stiffness), vectors.shape[1], vectors.shape[1]))
+    for own, matrix in zip(stiffness, model.free_stiffness, strict=True):  # V^T A V; A is empty but for its own rows
+        touched = np.flatnonzero(np.diff(matrix.indptr))
+        rows = vectors[touched]
+        for start in range(0, vectors.shape[1], CHUNK):
+            columns = slice(start, start + CHUNK)
+            own[:, columns] = rows.T @ times(matrix, vectors[:, columns])[touched]
+        own[:] = 0.5 * (own + own.T)
     load, coupling = np.asarray(vectors.T @ model.free_load), _coupling(model, vectors)
     outputs, constraint = np.asarray(model.constraint.free @ vectors), model.constraint
     none = np.zeros((len(outputs), model.material.n_modes))
@@ -286,13 +288,3 @@ def _checked(model: LinearModel, snapshots: NDArray[np.float64]) -> NDArray[np.f
 def _coupling(model: LinearModel, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """V^T C_r (n_regions, m, n_modes + 1)."""
     return np.stack([np.asarray((matrix.T @ vectors).T) for matrix in model.coupling])
-
-
-def _products(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """V^T A V (m, m) for V (n, m); a tissue's stiffness A is empty but for its own rows."""
-    touched = np.flatnonzero(np.diff(matrix.indptr))
-    own, result = vectors[touched], np.empty((vectors.shape[1],) * 2)
-    for start in range(0, vectors.shape[1], CHUNK):
-        columns = slice(start, start + CHUNK)
-        result[:, columns] = own.T @ times(matrix, vectors[:, columns])[touched]
-    return 0.5 * (result + result.T)

@@ -63,33 +63,18 @@ def cut(
 ) -> Grid:
     """Give the part of the `splittable` (n_tets,) tetrahedra where `phi` is negative to the region `inside`.
 
-    Nodes within `touch_mm` (n_nodes,) mm of the surface are moved onto it, or if they lie on an earlier surface count
-    as lying on both; edges that cross it are divided where phi, along them, is zero.
+    Nodes within `touch_mm` (n_nodes,) mm of the surface are moved onto it along its gradient, or if they lie on an
+    earlier surface count as lying on both; edges that cross it are divided where phi, along them, is zero.
     """
     active = np.unique(grid.tets[splittable])
     values = np.zeros(len(grid.nodes))
     values[active] = phi.at(grid.nodes[active])
     touching = np.flatnonzero(np.abs(values) < touch_mm)
     values[touching] = 0.0
-    grid = _moved_onto(grid, phi, np.intersect1d(touching, active), box)
-    ends = grid.tets[:, TET_EDGES]
-    crossed = np.prod(np.sign(values[ends]), axis=2) < 0
-    divided, parent = _divide(grid, crossed, lambda pairs: _roots(grid.nodes[pairs], values[pairs], phi))
-    values = np.concatenate([values, np.zeros(len(divided.nodes) - len(values))])
-    total = values[divided.tets].sum(axis=1)
-    flat = np.flatnonzero((total == 0.0) & splittable[parent])
-    total[flat] = phi.at(divided.nodes[divided.tets[flat]].mean(axis=1))
-    region = np.where(splittable[parent] & (total < 0.0), inside, divided.region)
-    return Grid(divided.nodes, divided.tets, region)
-
-
-def _moved_onto(grid: Grid, phi: LevelSet, chosen: NDArray[np.int64], box: Box) -> Grid:
-    """Move the chosen nodes onto the surface along its gradient, but for those of earlier surfaces."""
-    low = np.full(len(grid.nodes), np.iinfo(np.int64).max)
-    high = np.full(len(grid.nodes), -1)
+    low, high = np.full(len(grid.nodes), np.iinfo(np.int64).max), np.full(len(grid.nodes), -1)
     np.minimum.at(low, grid.tets, grid.region[:, None])
     np.maximum.at(high, grid.tets, grid.region[:, None])
-    free = np.setdiff1d(chosen, np.flatnonzero(high > low))
+    free = np.setdiff1d(np.intersect1d(touching, active), np.flatnonzero(high > low))  # of no earlier surface
     nodes = grid.nodes.copy()
     for _ in range(2):
         slope = within_faces(phi.gradient_at(nodes[free]), nodes[free], box)
@@ -101,7 +86,16 @@ def _moved_onto(grid: Grid, phi: LevelSet, chosen: NDArray[np.int64], box: Box) 
         if not bad.any():
             break
         nodes[grid.tets[bad]] = grid.nodes[grid.tets[bad]]
-    return Grid(nodes, grid.tets, grid.region)
+    ends = grid.tets[:, TET_EDGES]
+    crossed = np.prod(np.sign(values[ends]), axis=2) < 0
+    moved = Grid(nodes, grid.tets, grid.region)
+    divided, parent = _divide(moved, crossed, lambda pairs: _roots(nodes[pairs], values[pairs], phi))
+    values = np.concatenate([values, np.zeros(len(divided.nodes) - len(values))])
+    total = values[divided.tets].sum(axis=1)
+    flat = np.flatnonzero((total == 0.0) & splittable[parent])
+    total[flat] = phi.at(divided.nodes[divided.tets[flat]].mean(axis=1))
+    region = np.where(splittable[parent] & (total < 0.0), inside, divided.region)
+    return Grid(divided.nodes, divided.tets, region)
 
 
 def within_faces(vectors: NDArray[np.float64], points: NDArray[np.float64], box: Box) -> NDArray[np.float64]:
@@ -153,6 +147,8 @@ def _divide(
     In each tetrahedron the longest marked edge goes first. That order is the same on both sides of a face, so the
     result conforms.
     """
+    if not marked.any():
+        return grid, np.arange(len(grid.tets))
     n = len(grid.nodes)
     pairs = np.sort(grid.tets[:, TET_EDGES][marked], axis=1)
     length = np.linalg.norm(grid.nodes[pairs[:, 0]] - grid.nodes[pairs[:, 1]], axis=1)
@@ -163,40 +159,23 @@ def _divide(
     tets, parent = grid.tets, np.arange(len(grid.tets))
     done: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
     while len(tets):
-        edge, whole = _first_edge(tets, keys, rank, n)
+        pairs = np.sort(tets[:, TET_EDGES], axis=2)
+        key = np.where(pairs[..., 1] < n, pairs[..., 0] * n + pairs[..., 1], -1)  # none of edges to nodes that are new
+        place_of = np.clip(np.searchsorted(keys, key), 0, len(keys) - 1)
+        order = np.where(keys[place_of] == key, rank[place_of], len(keys))
+        whole = order.min(axis=1) == len(keys)
         done.append((tets[whole], parent[whole]))
-        tets, parent, edge = tets[~whole], parent[~whole], edge[~whole]
+        tets, parent, edge = tets[~whole], parent[~whole], order[~whole].argmin(axis=1)
         rows = np.arange(len(tets))
-        key = _edge_keys(tets, n)[rows, edge]
-        middle = n + np.searchsorted(keys, key)
+        middle = n + place_of[~whole][rows, edge]
         halves = []
         for end in range(2):
             half = tets.copy()
             half[rows, TET_EDGES[edge, end]] = middle
             halves.append(half)
         tets, parent = np.concatenate(halves), np.concatenate([parent, parent])
-    return Grid(nodes, np.concatenate([t for t, _ in done]), grid.region[np.concatenate([p for _, p in done])]), (
-        np.concatenate([p for _, p in done])
-    )
-
-
-def _first_edge(
-    tets: NDArray[np.int64], keys: NDArray[np.int64], rank: NDArray[np.int64], n: int
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Which of its six edges each tetrahedron divides first, and whether it has none to divide."""
-    if len(keys) == 0:
-        return np.zeros(len(tets), dtype=np.int64), np.ones(len(tets), dtype=bool)
-    key = _edge_keys(tets, n)
-    place = np.clip(np.searchsorted(keys, key), 0, len(keys) - 1)
-    order = np.where(keys[place] == key, rank[place], len(keys))
-    first = order.argmin(axis=1)
-    return first, order.min(axis=1) == len(keys)
-
-
-def _edge_keys(tets: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """One number for each edge (n_tets, 6); -1 for edges to nodes that are new (n and above): never divided."""
-    pairs = np.sort(tets[:, TET_EDGES], axis=2)
-    return np.asarray(np.where(pairs[..., 1] < n, pairs[..., 0] * n + pairs[..., 1], -1))
+    parent = np.concatenate([p for _, p in done])
+    return Grid(nodes, np.concatenate([t for t, _ in done]), grid.region[parent]), parent
 
 
 def _roots(ends: NDArray[np.float64], values: NDArray[np.float64], phi: LevelSet) -> NDArray[np.float64]:

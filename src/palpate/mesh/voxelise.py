@@ -52,7 +52,12 @@ def voxelise(
         raise GeometryError(
             f"the displacement has the shape {displacement.shape}, the space {space.points.shape}: give one row a point"
         )
-    triangles, inner, other = _interfaces(space.mesh)
+    faces = []  # between regions, each once, normals out of `inner` (n,) into `other` (n,)
+    for region in np.unique(space.mesh.region):
+        surface = tissue_surface(space.mesh, int(region))
+        first = (surface.other > region) | ~np.isin(surface.other, space.mesh.region)
+        faces.append((surface.triangles[first], np.full(int(first.sum()), region), surface.other[first]))
+    triangles, inner, other = (np.concatenate(parts) for parts in zip(*faces, strict=True))
     pieces = _pieces(space, displacement, triangles, subdivisions=subdivisions, warp=warp)
     count = 4**subdivisions
     code_inner, code_other = (
@@ -92,18 +97,6 @@ def _behind(
     nearest = KDTree(centres).query(grid.world(voxels[open_].astype(float)), workers=-1)[1]
     found[open_] = regions[nearest]
     return np.asarray(found)
-
-
-def _interfaces(mesh: TetMesh) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Triangles (n, 3) between regions, each once, normals out of `inner` (n,) into `other` (n,)."""
-    triangles, inner, other = [], [], []
-    for region in np.unique(mesh.region):
-        surface = tissue_surface(mesh, int(region))
-        first = (surface.other > region) | ~np.isin(surface.other, mesh.region)
-        triangles.append(surface.triangles[first])
-        other.append(surface.other[first])
-        inner.append(np.full(int(first.sum()), region))
-    return np.concatenate(triangles), np.concatenate(inner), np.concatenate(other)
 
 
 def _regions(codes: NDArray[np.int64], mesh: TetMesh, crossing: bool) -> NDArray[np.int16]:

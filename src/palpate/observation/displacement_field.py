@@ -19,7 +19,6 @@ from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.tissue import Role
 from palpate.mesh.locate import located
 from palpate.mesh.space import LagrangeSpace
-from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import DataFile, ReactionOf
 from palpate.observation.measured_points import MeasuredPoints, PointTable, read_point_table, refuse_slips
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
@@ -54,7 +53,10 @@ class DisplacementField(MeasuredPoints):
             )
         points, moved = self.table.before[inside], self.table.moved[inside]
         size = max(OF_LENGTH * self.file.correlation_mm, OF_EDGE * space.mesh.usual_edge_mm)
-        level = np.minimum(np.floor(np.log2(np.maximum(_away(space.mesh, points) / size, 1.0))), COARSER)[:, None]
+        mesh, sought = space.mesh, [n for n, t in enumerate(space.mesh.tissues) if t.role is Role.ESTIMATE]
+        nodes = np.unique(mesh.tets[np.isin(mesh.region, sought)])
+        away = np.asarray(cKDTree(mesh.nodes[nodes]).query(points)[0])
+        level = np.minimum(np.floor(np.log2(np.maximum(away / size, 1.0))), COARSER)[:, None]
         term = point_displacement(
             space,
             points,
@@ -65,13 +67,6 @@ class DisplacementField(MeasuredPoints):
             cells=np.floor(np.hstack([(points - points.min(axis=0)) / (size * 2.0**level), level])).astype(np.int64),
         )
         return term, ()
-
-
-def _away(mesh: TetMesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances (n,) mm of points (n, 3) mm to the nearest node of a tissue whose modulus is sought."""
-    sought = [number for number, tissue in enumerate(mesh.tissues) if tissue.role is Role.ESTIMATE]
-    nodes = np.unique(mesh.tets[np.isin(mesh.region, sought)])
-    return np.asarray(cKDTree(mesh.nodes[nodes]).query(points)[0])
 
 
 def read_displacement_field(file: DataFile) -> DisplacementField:
@@ -156,7 +151,10 @@ def _transform(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     sitk = _simpleitk(path)
     try:
         transform = sitk.ReadTransform(str(path))
-        parts = _parts(sitk, transform)
+        parts = [transform]
+        if transform.GetName() == "CompositeTransform":  # a file holds none within another
+            composite = sitk.CompositeTransform(transform)
+            parts = [composite.GetNthTransform(n) for n in range(composite.GetNumberOfTransforms())]
         images = {
             n: sitk.DisplacementFieldTransform(part).GetDisplacementField()
             for n, part in enumerate(parts)
@@ -182,14 +180,6 @@ def _transform(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return whole, affine
     except RuntimeError as error:
         raise InputDataError(f"'{path}' cannot be read by SimpleITK: {str(error).splitlines()[-1]}") from error
-
-
-def _parts(sitk: Any, transform: Any) -> list[Any]:
-    """The transforms of which one is made, in their order; a file holds none within another."""
-    if transform.GetName() != "CompositeTransform":
-        return [transform]
-    whole = sitk.CompositeTransform(transform)
-    return [whole.GetNthTransform(n) for n in range(whole.GetNumberOfTransforms())]
 
 
 def _on(sitk: Any, transform: Any, grid: Any) -> Any:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,28 +102,30 @@ def read_landmarks(file: DataFile) -> Landmarks:
 
 def _markups(content: str, path: Path) -> list[list[tuple[str, NDArray[np.float64]]]]:
     """The lists of points of a .mrk.json of 3D Slicer."""
+    lists = []
     try:
-        document = json.loads(content)
-        every = document["markups"]
-        return [list(_control_points(markup, path)) for markup in every]
+        for markup in json.loads(content)["markups"]:
+            system = str(markup.get("coordinateSystem", "LPS")).upper()
+            units = str(markup.get("coordinateUnits", "mm"))  # a word, or a list with a code
+            if system not in TO_RAS or "mm" not in units:
+                raise InputDataError(
+                    f"'{path}' has coordinates in {system[:20]!r}, {units[:20]!r}; export LPS or RAS in mm"
+                )
+            points = []
+            for point in markup["controlPoints"]:
+                if point.get("positionStatus", "defined") != "defined":
+                    continue
+                position = np.array([float(x) for x in point["position"]], dtype=np.float64)
+                if position.shape != (3,):
+                    raise InputDataError(f"a control point of '{path}' has {len(position)} coordinates; export three")
+                points.append((str(point.get("label", ""))[:200], TO_RAS[system] * position))
+            lists.append(points)
     except (ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
         raise InputDataError(
             f"'{path}' is no markups file of 3D Slicer ({type(error).__name__}: {error}); landmarks are read from"
             " .mrk.json, .fcsv and .csv"
         ) from error
-
-
-def _control_points(markup: Any, path: Path) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    system = str(markup.get("coordinateSystem", "LPS")).upper()
-    units = str(markup.get("coordinateUnits", "mm"))  # a word, or a list with a code
-    if system not in TO_RAS or "mm" not in units:
-        raise InputDataError(f"'{path}' has coordinates in {system[:20]!r}, {units[:20]!r}; export LPS or RAS in mm")
-    for point in markup["controlPoints"]:
-        if point.get("positionStatus", "defined") == "defined":
-            position = np.array([float(x) for x in point["position"]], dtype=np.float64)
-            if position.shape != (3,):
-                raise InputDataError(f"a control point of '{path}' has {len(position)} coordinates; export three")
-            yield str(point.get("label", ""))[:200], TO_RAS[system] * position
+    return lists
 
 
 def _fcsv(content: str, path: Path) -> list[list[tuple[str, NDArray[np.float64]]]]:

@@ -227,10 +227,17 @@ def _binned_products(
 
 
 def _cell_means(places: NDArray[np.float64], most: int) -> sparse.csr_matrix[np.float64]:
-    """Means (n_cells, n) over what lies in each cell of 1 mm, places (n, 3) mm; of so many cells at the most."""
+    """Means (n_cells, n) over what lies in each cell of 1 mm, places (n, 3) mm; of so many cells at the most.
+
+    Cells are chosen by numbers that follow from their keys but without order (the finaliser of SplitMix64; Steele et
+    al. 2014): they stay chosen when others come and go, so that the fit does not jump as a surface moves.
+    """
     keys, inverse = _cell_keys(places, CELL)
     shares = 1.0 / np.bincount(inverse)[inverse]
-    chosen = np.sort(np.argsort(_scattered(keys), kind="stable")[:most])
+    mixed = keys.astype(np.uint64)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
+    chosen = np.sort(np.argsort(mixed ^ (mixed >> np.uint64(31)), kind="stable")[:most])
     every: sparse.csr_matrix[np.float64] = sparse.csr_matrix((shares, (inverse, np.arange(len(inverse)))))
     return sparse.csr_matrix(every[chosen])
 
@@ -283,17 +290,6 @@ def _bins(distance: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.asarray(np.where(distance > 0.0, 1 + distance.astype(np.int64), 0))
 
 
-def _scattered(keys: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Numbers (n,) that follow from the keys (n,) but without order (the finaliser of SplitMix64; Steele et al. 2014).
-
-    Cells chosen by them stay chosen when others come and go, so that the fit does not jump as a surface moves.
-    """
-    mixed = keys.astype(np.uint64)
-    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
-        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
-    return np.asarray(mixed ^ (mixed >> np.uint64(31)))
-
-
 def _cell_keys(places: NDArray[np.float64], size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """A key for each cube of edge `size` (mm) that holds places (n, 3) mm, and the number of each place's cube (n,)."""
     cell = np.floor(places / size).astype(np.int64) % CELLS
@@ -331,7 +327,8 @@ def whitener(groups: NDArray[np.float64], length: float) -> sparse.csr_matrix[np
             tree = cKDTree(centres[order[:start]])
             near = order[:start][tree.query(centres[block], k=k)[1].reshape(len(block), k)]
         together = np.concatenate([near, block[:, None]], axis=1)
-        covariance = np.concatenate([_covariance(groups[part], length) for part in _parts(together)])
+        parts = [together[first : first + AT_ONCE] for first in range(0, len(together), AT_ONCE)]
+        covariance = np.concatenate([_covariance(groups[part], length) for part in parts])
         across, own = covariance[:, :k, k:], covariance[:, k, k]
         weights = np.linalg.solve(covariance[:, :k, :k] + 1e-10 * np.eye(k), across)[:, :, 0]
         left = np.maximum(own - np.einsum("nk,nk->n", weights, across[:, :, 0]), LEAST * own)
@@ -342,11 +339,6 @@ def whitener(groups: NDArray[np.float64], length: float) -> sparse.csr_matrix[np
         start = end
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
     return sparse.csr_matrix(entries, shape=(n, n))
-
-
-def _parts(together: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Rows (n, k) of numbers in parts of at most `AT_ONCE` rows: the distances of all at once would take gigabytes."""
-    return [together[start : start + AT_ONCE] for start in range(0, len(together), AT_ONCE)]
 
 
 def _covariance(points: NDArray[np.float64], length: float) -> NDArray[np.float64]:

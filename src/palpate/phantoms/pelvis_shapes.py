@@ -60,7 +60,21 @@ def _upright(rng: np.random.Generator) -> PelvisShapes:
     turn = _turn(rng, 12.0)
     reach = _reach(prostate.semi_axes, prostate.rotation, up) + _reach(semi_axes, turn, up)
     bladder = Ellipsoid((reach - rng.uniform(3.5, 6.0)) * up, semi_axes, turn)
-    rectum = _rectum(rng, prostate, bladder)
+    # a tube some 65 mm long behind the organs, brought to a gap of 8 to 10 mm from them
+    height = np.linspace(-0.5, 0.5, 5)
+    length = rng.uniform(40.0, 44.0)
+    bend, lean, side = rng.uniform(2.0, 8.0), rng.uniform(-3.0, 3.0), rng.uniform(-3.0, 3.0)
+    across = side + rng.uniform(-4.0, 4.0) * height
+    along = rng.uniform(11.0, 17.0) + length * height
+    knots = np.column_stack([across, -45.0 + lean * height - bend * height**2, along])
+    radii = rng.uniform(13.0, 14.5, 5)
+    gap, organs = rng.uniform(8.0, 10.0), Union([prostate, bladder])
+    for _ in range(20):
+        excess = float(organs.at(Tube(knots, radii).surface(_directions(400))).min()) - gap
+        if abs(excess) < 1e-3:
+            break
+        knots = knots + np.array([0.0, excess, 0.0])
+    rectum = Tube(knots, radii)
     # a tumour of at least 5 mL, off the prostate's centre, 2 mm or more (if there is room) under its surface
     semi_axes, turn = rng.uniform(10.7, 11.8, 3), _turn(rng, 90.0)
     away = 6.0 * _directions(1, rng)[0]
@@ -75,28 +89,6 @@ def _upright(rng: np.random.Generator) -> PelvisShapes:
         centre = np.array([side * (aside + rng.uniform(6.0, 9.0)), *rng.uniform([-4.0, -8.0], [4.0, 0.0])])
         bones.append(Ellipsoid(centre, semi_axes, _turn(rng, 15.0)))
     return PelvisShapes(prostate, bladder, rectum, tumour, (bones[0], bones[1]), np.array([0.0, 1.0, 0.0]))
-
-
-def _rectum(rng: np.random.Generator, prostate: Ellipsoid, bladder: Ellipsoid) -> Tube:
-    """A tube some 65 mm long behind the organs, brought to a gap of 8 to 10 mm from them."""
-    height = np.linspace(-0.5, 0.5, 5)
-    length = rng.uniform(40.0, 44.0)
-    bend, lean, side = rng.uniform(2.0, 8.0), rng.uniform(-3.0, 3.0), rng.uniform(-3.0, 3.0)
-    knots = np.column_stack(
-        [
-            side + rng.uniform(-4.0, 4.0) * height,
-            -45.0 + lean * height - bend * height**2,
-            rng.uniform(11.0, 17.0) + length * height,
-        ]
-    )
-    radii = rng.uniform(13.0, 14.5, 5)
-    gap, organs = rng.uniform(8.0, 10.0), Union([prostate, bladder])
-    for _ in range(20):
-        excess = float(organs.at(Tube(knots, radii).surface(_directions(400))).min()) - gap
-        if abs(excess) < 1e-3:
-            break
-        knots = knots + np.array([0.0, excess, 0.0])
-    return Tube(knots, radii)
 
 
 def _placed(body: PelvisShapes, rng: np.random.Generator, box: Box) -> PelvisShapes:

@@ -76,23 +76,8 @@ def series_beside(path: Path, uid: str) -> Series | None:
         head = pydicom.dcmread(io.BytesIO(content), stop_before_pixels=True, specific_tags=list(PLACE))
         if head.get("SeriesInstanceUID") == uid and all(name in head for name in PLACE):
             found.append((head, sha256))
-    return _stack(found, path) if found else None
-
-
-def _files(folder: Path) -> Iterator[Path]:
-    with os.scandir(folder) as entries:
-        inside = sorted(entries, key=lambda entry: entry.name)
-    for entry in inside:
-        if entry.is_file(follow_symlinks=False):
-            yield Path(entry.path)
-    for entry in inside:
-        if entry.is_dir(follow_symlinks=False):
-            with os.scandir(entry.path) as deeper:
-                files = sorted(each.path for each in deeper if each.is_file(follow_symlinks=False))
-            yield from map(Path, files)
-
-
-def _stack(found: list[tuple[Dataset, str]], path: Path) -> Series:
+    if not found:
+        return None
     first = found[0][0]
     across, down = np.array(first.ImageOrientationPatient, dtype=np.float64).reshape(2, 3)
     normal = np.cross(across, down)
@@ -120,3 +105,16 @@ def _stack(found: list[tuple[Dataset, str]], path: Path) -> Series:
     check_size(shape, 0, path, available=0, packed=False)
     empty, affine = to_canonical(np.zeros(shape, dtype=np.uint8), LPS_AFFINE @ lps)
     return Series(VoxelGrid((empty.shape[0], empty.shape[1], empty.shape[2]), affine), total)
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    with os.scandir(folder) as entries:
+        inside = sorted(entries, key=lambda entry: entry.name)
+    for entry in inside:
+        if entry.is_file(follow_symlinks=False):
+            yield Path(entry.path)
+    for entry in inside:
+        if entry.is_dir(follow_symlinks=False):
+            with os.scandir(entry.path) as deeper:
+                files = sorted(each.path for each in deeper if each.is_file(follow_symlinks=False))
+            yield from map(Path, files)

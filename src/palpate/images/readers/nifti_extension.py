@@ -85,12 +85,9 @@ class _Table:
 
     def _end(self, _: str) -> None:
         if tuple(self._open) == LABEL:
-            self._rows.append(self._row())
+            key, name = self._attributes.get("Key", ""), printable(self._name.strip())
+            if not (key.isascii() and key.isdigit() and len(key) <= 9) or len(name) > MAX_NAME:
+                raise self._refused(f"have the entry '{printable(key[:20])}': '{name[:50]}'")
+            parts = [self._attributes.get(colour, "") for colour in ("Red", "Green", "Blue")]
+            self._rows.append(NamedLabel(int(key), name, unit_colour(parts)))
         self._open.pop()
-
-    def _row(self) -> NamedLabel:
-        key, name = self._attributes.get("Key", ""), printable(self._name.strip())
-        if not (key.isascii() and key.isdigit() and len(key) <= 9) or len(name) > MAX_NAME:
-            raise self._refused(f"have the entry '{printable(key[:20])}': '{name[:50]}'")
-        parts = [self._attributes.get(colour, "") for colour in ("Red", "Green", "Blue")]
-        return NamedLabel(int(key), name, unit_colour(parts))

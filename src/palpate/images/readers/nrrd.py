@@ -7,7 +7,6 @@ header, and of a segmentation the names, colours, values and layers of its segme
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -52,14 +51,6 @@ MILLIMETRES = {"mm": 1.0, "millimeter": 1.0, "m": 1000.0, "cm": 10.0, "um": 0.00
 VECTOR = re.compile(r"none|\(([^()]*)\)", re.IGNORECASE)
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """`affine` (4, 4) index -> RAS mm of the axes in space, and which axis, if any, lists layers or channels."""
-
-    affine: NDArray[np.float64]
-    list_axes: tuple[int, ...]
-
-
 def read_nrrd(path: Path) -> StoredImage:
     """Read one image of three axes, or a segmentation with its layers, from `path`.
 
@@ -67,7 +58,7 @@ def read_nrrd(path: Path) -> StoredImage:
     """
     with opened(path) as file:
         header, keys = _header(file, path)
-        block, place = _block(header), _place(header)
+        block, (affine, list_axes) = _block(header), _place(header)
         text = header.fields.get("line skip", "0")
         if not (text.isascii() and text.isdigit() and len(text) <= 4):
             raise header.refused("line skip", "it must lie between 0 and 9999; export the image again")
@@ -80,19 +71,19 @@ def read_nrrd(path: Path) -> StoredImage:
 
         values, digests = voxels_of(file, path, header.fields.get("data file"), voxels)
     segments = segments_of(keys, path)
-    lists = [k for k in place.list_axes if values.shape[k] > 1]
+    lists = [k for k in list_axes if values.shape[k] > 1]
     if len(lists) > 1 or (lists and not segments):
         raise InputDataError(
             f"'{path}' has the sizes {list(values.shape)}, but an image of three axes is needed; extract one volume (a"
             " time point, a channel)"
         )
     keep = lists[:1]
-    squeezed = np.squeeze(values, axis=tuple(k for k in place.list_axes if k not in keep))
+    squeezed = np.squeeze(values, axis=tuple(k for k in list_axes if k not in keep))
     if not segments:
-        return StoredImage(squeezed, place.affine, digests=digests)
+        return StoredImage(squeezed, affine, digests=digests)
     layers = np.moveaxis(squeezed, keep[0], 0) if keep else squeezed[None]
     labels, names = flattened(layers, segments, path)
-    return StoredImage(labels, place.affine, names, digests)
+    return StoredImage(labels, affine, names, digests)
 
 
 def _header(file: BinaryIO, path: Path) -> tuple[TextHeader, dict[str, str]]:
@@ -137,8 +128,11 @@ def _block(header: TextHeader) -> VoxelBlock:
     return VoxelBlock(sizes, np.dtype(code).newbyteorder("<" if endian == "little" else ">"), packing, skip)
 
 
-def _place(header: TextHeader) -> _Place:
-    """By `space`, `space directions` and `space origin`; a missing origin is zero, as ITK has it."""
+def _place(header: TextHeader) -> tuple[NDArray[np.float64], tuple[int, ...]]:
+    """The affine (4, 4) index -> RAS mm of the axes in space, and which axis, if any, lists layers or channels.
+
+    By `space`, `space directions` and `space origin`; a missing origin is zero, as ITK has it.
+    """
     path = header.path
     signs = RAS_SIGNS.get(header.fields.get("space", "").lower())
     if signs is None or "space directions" not in header.fields:
@@ -160,7 +154,7 @@ def _place(header: TextHeader) -> _Place:
         raise header.refused("space units", 'it must be "mm" "mm" "mm"; correct it')
     affine[:3] *= np.array(signs)[:, None] * MILLIMETRES[units.pop()]
     affine += 0.0  # no minus zero
-    return _Place(affine, tuple(k for k in range(len(vectors)) if k not in in_space))
+    return affine, tuple(k for k in range(len(vectors)) if k not in in_space)
 
 
 register(ImageFormat("NRRD", (".nrrd", ".nhdr"), read_nrrd))

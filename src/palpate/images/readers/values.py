@@ -61,7 +61,12 @@ def to_canonical(values: NDArray[Any], affine: NDArray[np.float64]) -> tuple[NDA
     tie (a grid turned by 45 degrees) is broken by the resulting matrix, so that the way of storing never matters.
     """
     directions = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
-    order = max(permutations(range(3)), key=lambda axes: _rank(directions[:, axes]))
+    ranks = {}  # sum of the cosines along the diagonal, then the matrix, rounded so that storage noise breaks no tie
+    for axes in permutations(range(3)):
+        diagonal = np.diag(directions[:, axes])
+        upright = directions[:, axes] * np.where(diagonal < 0.0, -1.0, 1.0)
+        ranks[axes] = (round(float(np.abs(diagonal).sum()), 5), *np.round(upright, 5).ravel().tolist())
+    order = max(ranks, key=lambda axes: ranks[axes])
     flips = directions[range(3), order] < 0.0
     matrix = affine[:3, :3][:, order] * np.where(flips, -1.0, 1.0)
     last = np.array(values.shape)[list(order)] - 1
@@ -70,10 +75,3 @@ def to_canonical(values: NDArray[Any], affine: NDArray[np.float64]) -> tuple[NDA
     result[:3, 3] = affine[:3, 3] - matrix @ np.where(flips, last, 0)
     turned = np.flip(values.transpose(order), axis=tuple(np.flatnonzero(flips)))
     return np.ascontiguousarray(turned), result
-
-
-def _rank(directions: NDArray[np.float64]) -> tuple[float, ...]:
-    """Sum of the cosines along the diagonal, then the matrix itself, rounded so that storage noise breaks no tie."""
-    diagonal = np.diag(directions)
-    upright = directions * np.where(diagonal < 0.0, -1.0, 1.0)
-    return (round(float(np.abs(diagonal).sum()), 5), *np.round(upright, 5).ravel().tolist())
