@@ -144,6 +144,12 @@ class _State:
     centre: NDArray[np.float64]
     radius: float
 
+    @property
+    def misfit(self) -> float:
+        """Mean size of the residuals, mm, over the share of points inside: compares the ends of several starts."""
+        inside = np.count_nonzero(self.area) / len(self.area)
+        return float(self.area @ np.abs(self.residual) / self.area.sum() / inside)
+
 
 def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidFit:
     """One motion for several surfaces, each given by its (before, after) distance maps.
@@ -178,7 +184,7 @@ def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidF
         for start in starts:
             inside = [within_border(match.after.grid, start.apply(match.surface.places)) for match in matches]
             if sum(map(np.count_nonzero, inside)) >= MIN_POINTS:
-                best = min(best, _descend(start, matches), key=_misfit)
+                best = min(best, _descend(start, matches), key=lambda end: end.misfit)
     weight = best.area * tukey(best.residual, TUKEY * _scale(best))
     rms = float(np.sqrt(weight @ best.residual**2 / weight.sum()))
     return RigidFit(best.motion, rms, int(np.count_nonzero(weight)), _shown(best, weight)[1].T)
@@ -197,12 +203,22 @@ def align(before: Segmentation, after: Segmentation) -> Alignment:
     overall = fit_rigid_motion(list(pairs.values()))
 
     def alone(tissue: int) -> tuple[RigidFit, float]:
-        """The fit of one tissue, and how far a piece of it lies off that, mm."""
+        """The fit of one tissue, and the largest median distance of a separate piece of it from that, mm."""
         try:
             fit = fit_rigid_motion([pairs[tissue]]) if len(rigid) > 1 else overall
         except InputDataError:
             fit = replace(overall, n_points=0)
-        return fit, _off_the_motion(before.mask(tissue), pairs[tissue], fit.motion)
+        pieces, count = ndimage.label(before.mask(tissue), structure=np.ones((3, 3, 3)))
+        if count < 2:
+            return fit, 0.0
+        here, there = pairs[tissue]
+        places = seen_surface(here).places
+        places = places[within_border(there.grid, fit.motion.apply(places))]
+        nearest = np.clip(np.rint(here.grid.index(places)).astype(int), 0, np.array(pieces.shape) - 1)
+        number = ndimage.grey_dilation(pieces, size=(3, 3, 3))[tuple(nearest.T)]  # the surface lies beside the voxels
+        distance = np.abs(there.at(fit.motion.apply(places)) - here.at(places))
+        shown = [distance[number == piece] for piece in range(1, count + 1)]
+        return fit, max((float(np.median(one)) for one in shown if len(one) >= MIN_POINTS), default=0.0)
 
     names = [before.tissues[i].name for i in rigid]
     each = dict(zip(names, mapped(alone, rigid), strict=True))
@@ -230,25 +246,6 @@ def moved(segmentation: Segmentation, motion: RigidMotion) -> Segmentation:
     """The segmentation after a rigid motion (mm): the voxels are the same, only their affine changes."""
     grid = VoxelGrid(segmentation.grid.shape, motion.matrix @ segmentation.grid.affine)
     return replace(segmentation, grid=grid)
-
-
-def _off_the_motion(mask: NDArray[np.bool_], pair: tuple[DistanceMap, DistanceMap], motion: RigidMotion) -> float:
-    """The largest median distance (mm) of a separate piece of a tissue from where its motion takes it; 0 of one piece.
-
-    Pieces that show less surface than a motion is measured on are left out.
-    """
-    pieces, count = ndimage.label(mask, structure=np.ones((3, 3, 3)))
-    if count < 2:
-        return 0.0
-    before, after = pair
-    places = seen_surface(before).places
-    seen = within_border(after.grid, motion.apply(places))
-    places = places[seen]
-    nearest = np.clip(np.rint(before.grid.index(places)).astype(int), 0, np.array(mask.shape) - 1)
-    number = ndimage.grey_dilation(pieces, size=(3, 3, 3))[tuple(nearest.T)]  # the surface lies beside the voxels
-    distance = np.abs(after.at(motion.apply(places)) - before.at(places))
-    shown = [distance[number == piece] for piece in range(1, count + 1)]
-    return max((float(np.median(one)) for one in shown if len(one) >= MIN_POINTS), default=0.0)
 
 
 def _smoothed(surface: DistanceMap, voxel: float) -> DistanceMap:
@@ -345,12 +342,6 @@ def _cost(state: _State, scale: float) -> float:
     """Mean of Tukey's rho over the area."""
     rho = 1.0 - np.maximum(1.0 - (state.residual / (TUKEY * scale)) ** 2, 0.0) ** 3
     return float(state.area @ rho / state.area.sum())
-
-
-def _misfit(state: _State) -> float:
-    """Mean size of the residuals, mm, over the share of points that are inside: compares the ends of several starts."""
-    inside = np.count_nonzero(state.area) / len(state.area)
-    return float(state.area @ np.abs(state.residual) / state.area.sum() / inside)
 
 
 def _shown(state: _State, weight: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

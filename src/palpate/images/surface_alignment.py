@@ -79,6 +79,12 @@ class _Trial:
         """Number of points that come to lie inside the later image."""
         return int(sum(map(np.count_nonzero, self.seen)))
 
+    @property
+    def misfit(self) -> float:
+        """Mean size of the residuals, mm, over the share of points inside: compares the ends of several starts."""
+        inside = np.concatenate(self.seen)
+        return float(np.abs(np.concatenate(self.residuals)[inside]).mean() / inside.mean())
+
 
 def shown_tissues(segmentation: Segmentation) -> tuple[int, ...]:
     """Indices of the tissues that have a surface of their own: all but the meshed one that fills what others leave.
@@ -134,9 +140,12 @@ def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
             f"under {LEAST_POINTS} surface points come to lie inside the later image: the images show different parts"
             " of the body"
         )
-    best = min(found, key=_misfit)
-    if 2 * still.n_seen > best.n_seen and _odds(surfaces, still, best) < CLEARLY:
-        best = still
+    best = min(found, key=lambda trial: trial.misfit)
+    if 2 * still.n_seen > best.n_seen:
+        both, prior = [a & b for a, b in zip(still.seen, best.seen, strict=True)], _prior(best.parameters)
+        noises = (_noise(surfaces, trial, both) for trial in (still, best))  # at either, whichever says less
+        if min(_cost(still, noise, both, prior) - _cost(best, noise, both, prior) for noise in noises) < CLEARLY:
+            best = still
     seen = np.concatenate(best.seen)
     residual = np.concatenate(best.residuals)[seen]
     weight = tukey(residual, _cutoff(best))
@@ -222,23 +231,6 @@ def _prior(parameters: NDArray[np.float64]) -> NDArray[np.float64]:
     """Precision (6,) of turn and shift, less for unusually large ones: images may be in worlds of their own."""
     usual = np.array([np.deg2rad(TURN_DEG)] * 3 + [SHIFT_MM] * 3) ** -2.0
     return np.asarray(usual * min(1.0, len(usual) / max(float(usual @ parameters**2), 1e-12)))
-
-
-def _odds(surfaces: Sequence[_Shown], still: _Trial, moved: _Trial) -> float:
-    """Log of how much more probable a motion is than none, by the noise at either, whichever says less."""
-    both = [a & b for a, b in zip(still.seen, moved.seen, strict=True)]
-    prior = _prior(moved.parameters)
-    gains = []
-    for trial in (still, moved):
-        noise = _noise(surfaces, trial, both)
-        gains.append(_cost(still, noise, both, prior) - _cost(moved, noise, both, prior))
-    return min(gains)
-
-
-def _misfit(trial: _Trial) -> float:
-    """Mean size of the residuals, mm, over the share of points that are inside: compares the ends of several starts."""
-    inside = np.concatenate(trial.seen)
-    return float(np.abs(np.concatenate(trial.residuals)[inside]).mean() / inside.mean())
 
 
 def _cutoff(trial: _Trial) -> float:

@@ -37,31 +37,6 @@ def outer_constraint(
     """
     if outer not in OUTER_KINDS:
         raise ConfigurationError(f"outer_boundary is '{outer}'; it must be one of {list(OUTER_KINDS)}")
-    _check_prescription(space, modes, offset, prescribed)
-    cut, behind = cut_faces(space.mesh), [tissue.role is Role.SLIDING for tissue in space.mesh.tissues]
-    named = space.mesh.boundary[np.isin(space.mesh.beyond, np.flatnonzero(behind))]
-    sliding = np.concatenate([named, cut]) if outer == "sliding" else named
-    normals = triangle_normals(space.mesh.nodes, sliding)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    dyads, held = np.einsum("fi,fj->fij", normals, normals), np.zeros((len(space.points), 3, 3))
-    for column in space.facets(sliding).T:  # the sum of n (x) n over the unit normals n of the faces at each point
-        np.add.at(held, column, dyads)
-    if outer in ("fixed", "moving"):
-        held[np.unique(space.facets(cut))] = np.eye(3)
-    held[prescribed] = np.eye(3)
-    values, vectors = np.linalg.eigh(held)  # point by point free are the directions with no part in `held`
-    point, direction = np.nonzero(values <= SAME_PLANE * np.maximum(values[:, -1:], np.finfo(float).tiny))
-    columns, rows = np.repeat(np.arange(len(point)), 3), (3 * point[:, None] + np.arange(3)).ravel()
-    entries, shape = (vectors[point, :, direction].ravel(), (rows, columns)), (3 * len(held), len(point))
-    free: sparse.csr_matrix[np.float64] = sparse.csr_matrix(entries, shape=shape)
-    free.eliminate_zeros()
-    refuse_floating(space, free)
-    return Constraint(free=free, modes=np.array(modes, dtype=float), offset=np.array(offset, dtype=float))
-
-
-def _check_prescription(
-    space: LagrangeSpace, modes: NDArray[np.float64], offset: NDArray[np.float64], prescribed: NDArray[np.bool_]
-) -> None:
     n = len(space.points)
     if modes.ndim != 2 or len(modes) != 3 * n or offset.shape != (3 * n,) or prescribed.shape != (n,):
         raise ConfigurationError(
@@ -75,3 +50,22 @@ def _check_prescription(
             f"modes or offset move {int(stray.sum())} points that are not prescribed (the first is number"
             f" {int(np.flatnonzero(stray)[0])}): mark them in `prescribed` or set their rows to zero"
         )
+    cut, behind = cut_faces(space.mesh), [tissue.role is Role.SLIDING for tissue in space.mesh.tissues]
+    named = space.mesh.boundary[np.isin(space.mesh.beyond, np.flatnonzero(behind))]
+    sliding = np.concatenate([named, cut]) if outer == "sliding" else named
+    normals = triangle_normals(space.mesh.nodes, sliding)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    dyads, held = np.einsum("fi,fj->fij", normals, normals), np.zeros((n, 3, 3))
+    for column in space.facets(sliding).T:  # the sum of n (x) n over the unit normals n of the faces at each point
+        np.add.at(held, column, dyads)
+    if outer in ("fixed", "moving"):
+        held[np.unique(space.facets(cut))] = np.eye(3)
+    held[prescribed] = np.eye(3)
+    values, vectors = np.linalg.eigh(held)  # point by point free are the directions with no part in `held`
+    point, direction = np.nonzero(values <= SAME_PLANE * np.maximum(values[:, -1:], np.finfo(float).tiny))
+    columns, rows = np.repeat(np.arange(len(point)), 3), (3 * point[:, None] + np.arange(3)).ravel()
+    entries, shape = (vectors[point, :, direction].ravel(), (rows, columns)), (3 * n, len(point))
+    free: sparse.csr_matrix[np.float64] = sparse.csr_matrix(entries, shape=shape)
+    free.eliminate_zeros()
+    refuse_floating(space, free)
+    return Constraint(free=free, modes=np.array(modes, dtype=float), offset=np.array(offset, dtype=float))

@@ -71,8 +71,20 @@ def read_mesh_file(path: Path, *, data: str | None = None) -> MeshFile:
         raise InputDataError(f"'{path}' holds {kinds} and no tetrahedra; export a volume mesh of 4 or 10 nodes a cell")
     tets = np.concatenate([np.asarray(mesh.cells[i].data)[:, :4] for i in chosen]).astype(np.int64)
     group = _groups(mesh, chosen, data, path)
-    names = {int(ids[0]): str(name)[:200] for name, ids in mesh.field_data.items() if len(ids) > 1 and ids[1] == 3}
-    return MeshFile(*_sound(nodes, tets, path), group, names, _surfaces(mesh), digest)
+    of_tets, of_faces = (
+        {int(ids[0]): str(name)[:200] for name, ids in mesh.field_data.items() if len(ids) > 1 and ids[1] == dimension}
+        for dimension in (3, 2)
+    )
+    nodes, tets = _sound(nodes, tets, path)
+    parts: dict[str, list[NDArray[np.int64]]] = {}
+    for i, block in enumerate(mesh.cells):
+        if block.type in TRIANGLES and "gmsh:physical" in mesh.cell_data:
+            numbers = np.asarray(mesh.cell_data["gmsh:physical"][i]).astype(np.int64)
+            for number in np.unique(numbers).tolist():
+                own = np.asarray(block.data)[numbers == number, :3].astype(np.int64)
+                parts.setdefault(of_faces.get(number, str(number)), []).append(own)
+    surfaces = {name: np.concatenate(own) for name, own in parts.items()}
+    return MeshFile(nodes, tets, group, of_tets, surfaces, digest)
 
 
 def _groups(mesh: Any, chosen: Sequence[int], data: str | None, path: Path) -> NDArray[np.int64]:
@@ -87,19 +99,6 @@ def _groups(mesh: Any, chosen: Sequence[int], data: str | None, path: Path) -> N
     if not np.array_equal(values, np.rint(values)):
         raise InputDataError(f"the cell data '{key}' of '{path}' are no whole numbers; name others in tissue_data")
     return values.astype(np.int64)
-
-
-def _surfaces(mesh: Any) -> dict[str, NDArray[np.int64]]:
-    """Triangles by the name of their physical group."""
-    names = {int(ids[0]): str(name)[:200] for name, ids in mesh.field_data.items() if len(ids) > 1 and ids[1] == 2}
-    found: dict[str, list[NDArray[np.int64]]] = {}
-    for i, block in enumerate(mesh.cells):
-        if block.type in TRIANGLES and "gmsh:physical" in mesh.cell_data:
-            numbers = np.asarray(mesh.cell_data["gmsh:physical"][i]).astype(np.int64)
-            for number in np.unique(numbers).tolist():
-                own = np.asarray(block.data)[numbers == number, :3].astype(np.int64)
-                found.setdefault(names.get(number, str(number)), []).append(own)
-    return {name: np.concatenate(parts) for name, parts in found.items()}
 
 
 def _sound(

@@ -75,13 +75,34 @@ def pair_estimates(
     """The estimate of each later state alone, near the joint `minimum`: with its closest points, weights and prior.
 
     And a second one near where the joint estimate ends with blocks free that were held, if it is `released`, its
-    covariance larger by what these add (see `added_by`). errors: of the residuals on random grids (see `grid_errors`).
-    Nothing is solved; the approximations of the joint estimate stand. Raises `EstimationError` where a state alone
-    leaves a driver's motion open.
+    covariance larger by what these add (see `added_by`). The covariance has parts by noise and prior, by what is
+    considered, by the place of the grid (see `grid_covariance`), and by the mesh, which those of one reference share.
+    errors: of the residuals on random grids (see `grid_errors`). Nothing is solved; the approximations of the joint
+    estimate stand. Raises `EstimationError` where a state alone leaves a driver's motion open.
     """
     alone = _each_alone(objective, minimum, bounds)
     noise, prior = _noise_and_prior(objective, alone)
-    covariance = _joint_covariance(objective, alone, errors, noise=noise, prior=prior)
+    n, n_pairs, mapping = objective.n_parameters, len(alone), objective.parameters
+    considered = np.zeros((mapping.n_unknowns, n * n_pairs))  # J_b^T W J H_s^-1 e_i
+    shifts, mesh = list[NDArray[np.float64]](), np.zeros((n_pairs, n, n_pairs, n))
+    references = [state.reference for state in objective.states]
+    states = [s for s, state in enumerate(objective.states) for _ in state.observations]  # of each observation
+    for s, evaluation in enumerate(of.evaluation for of in alone):
+        of_data = evaluation.matrix - evaluation.prior
+        considered[mapping.alone(s)[1], s * n : (s + 1) * n] = of_data @ evaluation.covariance_columns(n)
+        seen = [i for i, state in enumerate(states) if state == s]
+        shifts.append(shifts_by(evaluation, [[draw[i] for i in seen] for draw in errors], n))
+        of_mesh = mesh_covariance(replace(objective, states=(objective.states[s],)))
+        for t in range(n_pairs):
+            mesh[s, :, t] += of_mesh if references[s] == references[t] else 0.0
+    total = noise + prior
+    for i, block in enumerate(mapping.blocks):
+        if block.considered:
+            of_block = considered[mapping.columns(i)]
+            total += of_block.T @ np.linalg.solve(block.precision, of_block)
+    itself = np.kron(np.eye(n_pairs), np.ones((n, n)))
+    grid = scatter(np.concatenate(shifts, axis=1)) * (BETWEEN_GRIDS + (1.0 - BETWEEN_GRIDS) * itself)
+    covariance = (total + grid_covariance(alone[0].evaluation, grid, noise)).reshape(mesh.shape) + mesh
     found = [_estimates(alone, covariance)]
     if released is not None:
         free = _each_alone(released.objective, released.minimum, bounds)
@@ -128,42 +149,6 @@ def _noise_and_prior(objective: Objective, alone: Sequence[Minimum]) -> tuple[ND
             placed[columns] = rows
             pairs.append((replace(line, state=s), placed))
     return noise_covariance(objective, pairs, noise), np.asarray(answers.T @ mapping.prior_matrix @ answers)
-
-
-def _joint_covariance(
-    objective: Objective,
-    alone: Sequence[Minimum],
-    errors: GridErrors,
-    *,
-    noise: NDArray[np.float64],
-    prior: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Covariance (n_pairs, n, n_pairs, n) of the estimates of each state alone.
-
-    To those by noise and prior, (n_pairs n, n_pairs n) each, comes what is considered; the place of the grid (see
-    `grid_covariance`); and the mesh, which those of one reference share.
-    """
-    n, n_pairs, mapping = objective.n_parameters, len(alone), objective.parameters
-    considered = np.zeros((mapping.n_unknowns, n * n_pairs))  # J_b^T W J H_s^-1 e_i
-    shifts, mesh = list[NDArray[np.float64]](), np.zeros((n_pairs, n, n_pairs, n))
-    references = [state.reference for state in objective.states]
-    states = [s for s, state in enumerate(objective.states) for _ in state.observations]  # of each observation
-    for s, evaluation in enumerate(of.evaluation for of in alone):
-        of_data = evaluation.matrix - evaluation.prior
-        considered[mapping.alone(s)[1], s * n : (s + 1) * n] = of_data @ evaluation.covariance_columns(n)
-        seen = [i for i, state in enumerate(states) if state == s]
-        shifts.append(shifts_by(evaluation, [[draw[i] for i in seen] for draw in errors], n))
-        of_mesh = mesh_covariance(replace(objective, states=(objective.states[s],)))
-        for t in range(n_pairs):
-            mesh[s, :, t] += of_mesh if references[s] == references[t] else 0.0
-    total = noise + prior
-    for i, block in enumerate(mapping.blocks):
-        if block.considered:
-            of_block = considered[mapping.columns(i)]
-            total += of_block.T @ np.linalg.solve(block.precision, of_block)
-    itself = np.kron(np.eye(n_pairs), np.ones((n, n)))
-    grid = scatter(np.concatenate(shifts, axis=1)) * (BETWEEN_GRIDS + (1.0 - BETWEEN_GRIDS) * itself)
-    return np.asarray((total + grid_covariance(alone[0].evaluation, grid, noise)).reshape(mesh.shape) + mesh)
 
 
 def agreement(pairs: PairEstimates) -> Agreement:

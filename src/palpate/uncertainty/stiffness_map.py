@@ -196,7 +196,8 @@ def stiffness_maps(inversion: Inversion, variances: NDArray[np.float64]) -> tupl
 
 def _region(mesh: TetMesh, elements: NDArray[np.int64], field: _Field) -> DifferentRegion | None:
     """The largest connected part that is likely another stiffness, and certainly so somewhere; None: there is none."""
-    sd, found = np.sqrt(np.maximum(field.variance, 1e-300)), list[DifferentRegion]()
+    sd, volumes = np.sqrt(np.maximum(field.variance, 1e-300)), mesh.volumes[elements]
+    parts = list[tuple[float, NDArray[np.int64], NDArray[np.float64]]]()
     for sign in (1.0, -1.0):
         probability = ndtr((sign * field.mean - np.log(CONTRAST)) / sd)
         likely = np.flatnonzero(probability > LIKELY)
@@ -206,18 +207,12 @@ def _region(mesh: TetMesh, elements: NDArray[np.int64], field: _Field) -> Differ
         of_face = sparse.csr_matrix((np.ones(len(owner)), (owner, face.ravel())), shape=(len(likely), len(faces)))
         _, part = connected_components(of_face @ of_face.T)  # joined through faces
         for label in np.unique(part[probability[likely] > CERTAIN]):
-            found.append(_different(mesh, elements, field, likely[part == label], probability))
-    return max(found, key=lambda region: region.volume_ml, default=None)
-
-
-def _different(
-    mesh: TetMesh,
-    elements: NDArray[np.int64],
-    field: _Field,
-    inside: NDArray[np.int64],
-    probability: NDArray[np.float64],
-) -> DifferentRegion:
-    volumes, outside = mesh.volumes[elements], ~np.isin(np.arange(len(elements)), inside)
+            inside = likely[part == label]
+            parts.append((float(volumes[inside].sum()) / MM3_PER_ML, inside, probability))
+    if not parts:
+        return None
+    volume_ml, inside, probability = max(parts, key=lambda found: found[0])
+    outside = ~np.isin(np.arange(len(elements)), inside)
     # A normal law blurs the border: the core alone is all of the part. A variation draws it: the core would be chance.
     core = ~outside & ((probability > CERTAIN) | (field.variation is not None))
     weights = core * volumes / volumes[core].sum() - outside * volumes / max(float(volumes[outside].sum()), 1e-300)
@@ -226,7 +221,7 @@ def _different(
     centres = mesh.nodes[mesh.tets[elements[inside]]].mean(axis=1)
     return DifferentRegion(
         elements[inside],
-        float(volumes[inside].sum()) / MM3_PER_ML,
+        volume_ml,
         np.average(centres, axis=0, weights=volumes[inside]),
         float(np.exp(contrast)),
         (float(np.exp(contrast - half)), float(np.exp(contrast + half))),

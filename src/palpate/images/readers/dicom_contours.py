@@ -109,7 +109,7 @@ def _structures(dataset: Dataset, to_index: NDArray[np.float64], path: Path) -> 
         if len(item.get("ROIDisplayColor") or ()) == 3:
             red, green, blue = (float(part) for part in item.ROIDisplayColor)
             colour = hex_colour(red, green, blue, top=255)
-        contours: list[NDArray[np.float64]] = []
+        contours, heights, areas = list[NDArray[np.float64]](), list[float](), list[list[NDArray[np.float64]]]()
         n_open = n_short = 0
         for contour in item.ContourSequence:
             points = _points(contour)
@@ -119,29 +119,20 @@ def _structures(dataset: Dataset, to_index: NDArray[np.float64], path: Path) -> 
                 n_open += 1
             else:
                 contours.append(points @ to_index[:3, :3].T + to_index[:3, 3])
-        heights, areas = _planes(contours, name, path)
-        structures.append(_Structure(NamedLabel(label, name, colour), heights, areas, n_open, n_short))
+        for points in sorted(contours, key=lambda points: float(points[:, 0].mean())):
+            height, spread = float(points[:, 0].mean()), float(np.ptp(points[:, 0]))
+            if not spread <= ONE_PLANE:
+                raise InputDataError(
+                    f"a contour of '{name}' in '{path}' runs over {spread:.3g} slices of its series, not one;"
+                    " export the structures on the slices that they were drawn on"
+                )
+            if not heights or height - heights[-1] > ONE_PLANE:
+                heights.append(height)
+                areas.append([])
+            areas[-1].append(points[:, 1:])
+        row, planes = NamedLabel(label, name, colour), tuple(map(tuple, areas))
+        structures.append(_Structure(row, np.array(heights), planes, n_open, n_short))
     return structures
-
-
-def _planes(
-    contours: Sequence[NDArray[np.float64]], name: str, path: Path
-) -> tuple[NDArray[np.float64], tuple[tuple[NDArray[np.float64], ...], ...]]:
-    """The heights of the planes that contours lie in, and the contours of each."""
-    heights: list[float] = []
-    areas: list[list[NDArray[np.float64]]] = []
-    for contour in sorted(contours, key=lambda points: float(points[:, 0].mean())):
-        height, spread = float(contour[:, 0].mean()), float(np.ptp(contour[:, 0]))
-        if not spread <= ONE_PLANE:
-            raise InputDataError(
-                f"a contour of '{name}' in '{path}' runs over {spread:.3g} slices of its series, not one;"
-                " export the structures on the slices that they were drawn on"
-            )
-        if not heights or height - heights[-1] > ONE_PLANE:
-            heights.append(height)
-            areas.append([])
-        areas[-1].append(contour[:, 1:])
-    return np.array(heights), tuple(tuple(area) for area in areas)
 
 
 def _flaws(structures: Sequence[_Structure]) -> tuple[Finding, ...]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from highdicom.color import CIELabColor
 from highdicom.seg import Segmentation
-from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.findings import Finding
@@ -58,26 +56,18 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
                 colour = hex_colour(red, green, blue, top=255)
             name = printable(str(item.get("SegmentLabel", "")).strip())[:MAX_NAME] or f"segment {number}"
             rows.append(NamedLabel(number, name, colour))
-        labels, findings = _labels(segmentation, rows, tuple(geometry.spatial_shape))
+        findings: tuple[Finding, ...] = ()
+        if dataset.SegmentationType == "LABELMAP":
+            labels = np.asarray(segmentation.get_volume(combine_segments=True, dtype=np.uint16).array)
+        else:
+            volumes = (segmentation.get_volume(segment_numbers=[row.label], dtype=np.uint8) for row in rows)
+            masks = (Mask(row, np.asarray(of.array)[..., 0] > 0) for row, of in zip(rows, volumes, strict=True))
+            labels, findings = merged(masks, tuple(geometry.spatial_shape))
         affine = LPS_AFFINE @ geometry.affine
         referenced = dataset.get("ReferencedSeriesSequence") or ()
         series = series_beside(path, str(referenced[0].SeriesInstanceUID)) if referenced else None
         series = series or (Series(grid) if grid else None)
         return _completed(StoredImage(labels, affine, tuple(rows), {"": sha256}, findings), series)
-
-
-def _labels(
-    segmentation: Segmentation, rows: Sequence[NamedLabel], shape: tuple[int, ...]
-) -> tuple[NDArray[np.uint16], tuple[Finding, ...]]:
-    if segmentation.SegmentationType == "LABELMAP":
-        return np.asarray(segmentation.get_volume(combine_segments=True, dtype=np.uint16).array), ()
-
-    def masks() -> Iterator[Mask]:
-        for row in rows:
-            volume = segmentation.get_volume(segment_numbers=[row.label], dtype=np.uint8)
-            yield Mask(row, np.asarray(volume.array)[..., 0] > 0)
-
-    return merged(masks(), shape)
 
 
 def _completed(image: StoredImage, series: Series | None) -> StoredImage:

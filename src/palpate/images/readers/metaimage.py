@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.images.label_image import LPS_TO_RAS
@@ -47,29 +45,37 @@ LAST = "elementdatafile"
 def read_metaimage(path: Path) -> StoredImage:
     """Read one image of three axes from `path`; raises `InputDataError` with a sentence for whatever is wrong."""
     with opened(path) as file:
-        header = _header(file, path)
-        block, affine = _block(header), _affine(header)
-        name = None if header.fields[LAST].upper() == "LOCAL" else header.fields[LAST]
-        values, digests = voxels_of(file, path, name, lambda rest: read_block(rest, block, path))
-    return StoredImage(values.reshape(block.shape[:3], order="F"), affine, digests=digests)
-
-
-def _header(file: BinaryIO, path: Path) -> TextHeader:
-    """Fields in lower case, up to the one that says where the voxels are."""
-    fields: dict[str, str] = {}
-    while LAST not in fields:
-        line = header_line(file, path)
-        name, equals, value = (line or "").partition("=")
-        if line is None or not equals or not re.fullmatch(r"\w+", name.strip(), re.ASCII):
-            raise InputDataError(
-                f"'{path}' does not begin as a MetaImage file does; export the image as MetaImage or NIfTI"
+        fields: dict[str, str] = {}  # in lower case, up to the one that says where the voxels are
+        while LAST not in fields:
+            line = header_line(file, path)
+            name, equals, value = (line or "").partition("=")
+            if line is None or not equals or not re.fullmatch(r"\w+", name.strip(), re.ASCII):
+                raise InputDataError(
+                    f"'{path}' does not begin as a MetaImage file does; export the image as MetaImage or NIfTI"
+                )
+            field = SYNONYMS.get(name.strip().lower(), name.strip().lower())
+            if field in fields:
+                raise InputDataError(f"the header of '{path}' has '{field[:60]}' twice; export the image again")
+            fields[field] = value.strip()
+        header = TextHeader(fields, path)
+        block = _block(header)
+        header.need("transformmatrix", "so left and right are unknown; export the image with its orientation")
+        rows = header.numbers("transformmatrix", 9).reshape(3, 3)
+        sizes = "elementspacing" if "elementspacing" in fields else "elementsize"
+        header.need(sizes, "so its scale is unknown; export it again")
+        spacing = header.numbers(sizes, 3)
+        if not (spacing > 0.0).all():
+            raise header.refused(
+                sizes,
+                "it must be positive: programs take a sign there for a mirror or not; turn the axis in TransformMatrix,"
+                " or export the image again",
             )
-        name = name.strip().lower()
-        name = SYNONYMS.get(name, name)
-        if name in fields:
-            raise InputDataError(f"the header of '{path}' has '{name[:60]}' twice; export the image again")
-        fields[name] = value.strip()
-    return TextHeader(fields, path)
+        affine = np.eye(4)  # ITK takes the world of every MetaImage for LPS, whatever AnatomicalOrientation says
+        affine[:3, :3] = LPS_TO_RAS[:, None] * rows.T * spacing
+        affine[:3, 3] = LPS_TO_RAS * header.numbers("offset", 3, fields.get("offset", "0 0 0"))
+        beside = None if fields[LAST].upper() == "LOCAL" else fields[LAST]
+        values, digests = voxels_of(file, path, beside, lambda rest: read_block(rest, block, path))
+    return StoredImage(values.reshape(block.shape[:3], order="F"), affine + 0.0, digests=digests)  # no minus zero
 
 
 def _block(header: TextHeader) -> VoxelBlock:
@@ -99,25 +105,6 @@ def _flag(header: TextHeader, field: str, *, default: bool = False) -> bool:
     if value not in ("true", "false", "1", "0"):
         raise header.refused(field, "it is not True or False: correct it")
     return value in ("true", "1")
-
-
-def _affine(header: TextHeader) -> NDArray[np.float64]:
-    """Index -> RAS mm; ITK takes the world of every MetaImage for LPS, whatever AnatomicalOrientation says."""
-    header.need("transformmatrix", "so left and right are unknown; export the image with its orientation")
-    rows = header.numbers("transformmatrix", 9).reshape(3, 3)
-    name = "elementspacing" if "elementspacing" in header.fields else "elementsize"
-    header.need(name, "so its scale is unknown; export it again")
-    spacing = header.numbers(name, 3)
-    if not (spacing > 0.0).all():
-        raise header.refused(
-            name,
-            "it must be positive: programs take a sign there for a mirror or not; turn the axis in TransformMatrix, or"
-            " export the image again",
-        )
-    affine = np.eye(4)
-    affine[:3, :3] = LPS_TO_RAS[:, None] * rows.T * spacing
-    affine[:3, 3] = LPS_TO_RAS * header.numbers("offset", 3, header.fields.get("offset", "0 0 0"))
-    return affine + 0.0  # no minus zero
 
 
 register(ImageFormat("MetaImage", (".mha", ".mhd"), read_metaimage))

@@ -42,7 +42,21 @@ def read_stl(path: Path, *, axes: str = "RAS") -> SurfaceFile:
         raise InputDataError(f"'{path}' cannot be read: {error}; check the path") from error
     if len(content) > MOST_BYTES:
         raise InputDataError(f"'{path}' is larger than {MOST_BYTES // 2**20} MB; simplify the surface")
-    corners = _corners(content, path)
+    count = int.from_bytes(content[HEADING : HEADING + 4], "little")
+    if len(content) == HEADING + 4 + count * FACET.itemsize:
+        corners = np.asarray(np.frombuffer(content, FACET, count, HEADING + 4)["corners"], dtype=np.float64)
+    elif content.lstrip()[:5].lower() != b"solid":
+        raise InputDataError(
+            f"'{path}' is no STL: neither a text that begins with 'solid', nor whole triangles; export it"
+        )
+    elif len(content) > MOST_TEXT:
+        raise InputDataError(f"'{path}' is a text of over {MOST_TEXT // 2**20} MB; export it as a binary STL")
+    else:
+        found = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", content)
+        try:
+            corners = np.array(found, dtype=np.float64).reshape(-1, 3, 3)
+        except ValueError as error:
+            raise InputDataError(f"'{path}' is a damaged text ({error}); export it again") from error
     if not np.isfinite(corners).all() or np.abs(corners).max(initial=0.0) > MOST_MM:
         raise InputDataError(f"'{path}' has coordinates that are no number of millimetres; export it again")
     told = re.search(rb"SPACE=(RAS|LPS)", content[:HEADING])
@@ -58,24 +72,3 @@ def read_stl(path: Path, *, axes: str = "RAS") -> SurfaceFile:
             " has no inside; fill its holes where it was made"
         )
     return SurfaceFile(points * signs, triangles, digest)
-
-
-def _corners(content: bytes, path: Path) -> NDArray[np.float64]:
-    """Corners (m, 3, 3) of the triangles of a binary or a text file."""
-    if len(content) >= HEADING + 4:
-        count = int.from_bytes(content[HEADING : HEADING + 4], "little")
-        if len(content) == HEADING + 4 + count * FACET.itemsize:
-            facets = np.frombuffer(content, FACET, count, HEADING + 4)
-            return np.asarray(facets["corners"], dtype=np.float64)
-    if not content.lstrip()[:5].lower() == b"solid":
-        raise InputDataError(
-            f"'{path}' is no STL: neither a text that begins with 'solid', nor whole triangles; export it"
-        )
-    if len(content) > MOST_TEXT:
-        raise InputDataError(f"'{path}' is a text of over {MOST_TEXT // 2**20} MB; export it as a binary STL")
-    found = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", content)
-    try:
-        values = np.array(found, dtype=np.float64).reshape(-1, 3, 3)
-    except ValueError as error:
-        raise InputDataError(f"'{path}' is a damaged text ({error}); export it again") from error
-    return values
