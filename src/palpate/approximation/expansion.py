@@ -69,13 +69,21 @@ class Expansion:
         T + (C - T D) (D^T H D)^+ D^T H: of all T' with T' D = C the one that changes least. The other columns stay as
         they were where T was made. Raises `NotConverged` when there is no equilibrium.
         """
-        there = self if at.same_as(self.place) else self._around(self._equilibrium(at))
+        there, before = self, self.equilibrium
+        if not at.same_as(self.place):  # from where the expansion says that it is, else from the present one
+            start = self.model.solve(at.moduli, at.coefficients).displacement
+            found = before.model.attempt(at.moduli, at.coefficients, start=start, nearby=before.factorisation)
+            if not found.converged:
+                found = before.model.attempt(at.moduli, at.coefficients, start=before.displacement)
+            if not found.converged:
+                raise NotConverged(f"no equilibrium near the estimate: {found.reason}")
+            there = self._around(found)
         few = there.model.n_regions + there.model.n_modes <= FEW
         if at.directions is None or at.metric is None:
             return there
         directions = np.eye(len(at.directions)) if few else at.directions
-        before = there.model.derivatives @ directions
-        change = there.equilibrium.tangent_along(directions, before) - before
+        known = there.model.derivatives @ directions
+        change = there.equilibrium.tangent_along(directions, known) - known
         with determined():
             share = np.linalg.pinv(directions.T @ at.metric @ directions, hermitian=True) @ (directions.T @ at.metric)
         sharper = replace(there.model, derivatives=there.model.derivatives + change @ share)
@@ -99,16 +107,6 @@ class Expansion:
         model, nearby = self.equilibrium.model.to_tolerance(tolerance), self.factorisation
         start = self.model.solve(at.moduli, at.coefficients).displacement
         return self._around(from_start(model, at.moduli, at.coefficients, start=start, nearby=nearby))
-
-    def _equilibrium(self, at: LinearisationPoint) -> FiniteStrainEquilibrium:
-        """The equilibrium at a place, from where the expansion says that it is, else from the present one."""
-        before, start = self.equilibrium, self.model.solve(at.moduli, at.coefficients).displacement
-        found = before.model.attempt(at.moduli, at.coefficients, start=start, nearby=before.factorisation)
-        if not found.converged:
-            found = before.model.attempt(at.moduli, at.coefficients, start=before.displacement)
-        if not found.converged:
-            raise NotConverged(f"no equilibrium near the estimate: {found.reason}")
-        return found
 
     def _around(self, there: FiniteStrainEquilibrium) -> Expansion:
         """The expansion around an equilibrium so near that its derivatives still hold there: a third of the price."""

@@ -126,14 +126,6 @@ class _Match:
 
 
 @dataclass(frozen=True, slots=True)
-class _Moments:
-    """Centroid (3,) mm and covariance (3, 3) mm^2 of surfaces, by area."""
-
-    centre: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
 class _State:
     """A trial motion: residuals (n,) mm, their derivative (n, 6) by turn (rad) and shift (mm), area (n,) mm^2."""
 
@@ -174,13 +166,14 @@ def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidF
                 f"the {where} image shows {n} surface points of the rigid tissue away from its border, {MIN_POINTS} are"
                 " needed; enlarge the image, or give the tissue another role"
             )
-    source, aim = _moments([match.surface for match in matches]), _moments(target)
-    best = _descend(_about_centroids(np.eye(3), source, aim), matches)
+    centre, spread = _moments([match.surface for match in matches])
+    aim, aimed = _moments(target)
+    best = _descend(RigidMotion(np.eye(3), aim - centre), matches)
     if _scale(best) > 0.25 * voxel:
         # the four proper rotations that lay the principal axes of one surface on those of the other
-        first, second = (np.linalg.eigh(moments.covariance)[1] for moments in (source, aim))
+        first, second = (np.linalg.eigh(covariance)[1] for covariance in (spread, aimed))
         turns = [second @ np.diag(signs) @ first.T for signs in product((1.0, -1.0), repeat=3)]
-        starts = [_about_centroids(turn, source, aim) for turn in turns if np.linalg.det(turn) > 0.0]
+        starts = [RigidMotion(turn, aim - turn @ centre) for turn in turns if np.linalg.det(turn) > 0.0]
         for start in starts:
             inside = [within_border(match.after.grid, start.apply(match.surface.places)) for match in matches]
             if sum(map(np.count_nonzero, inside)) >= MIN_POINTS:
@@ -260,16 +253,13 @@ def seen_surface(distance: DistanceMap) -> IsosurfacePoints:
     return IsosurfacePoints(found.places[keep], found.normals[keep], found.area[keep])
 
 
-def _moments(surfaces: Sequence[IsosurfacePoints]) -> _Moments:
+def _moments(surfaces: Sequence[IsosurfacePoints]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Centroid (3,) mm and covariance (3, 3) mm^2 of surfaces, by area."""
     places, area = np.concatenate([s.places for s in surfaces]), np.concatenate([s.area for s in surfaces])
     share = area / area.sum()
     centre = share @ places
     offset = places - centre
-    return _Moments(centre, (offset * share[:, None]).T @ offset)
-
-
-def _about_centroids(turn: NDArray[np.float64], source: _Moments, target: _Moments) -> RigidMotion:
-    return RigidMotion(turn, target.centre - turn @ source.centre)
+    return centre, (offset * share[:, None]).T @ offset
 
 
 def _descend(motion: RigidMotion, matches: Sequence[_Match]) -> _State:

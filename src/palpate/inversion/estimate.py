@@ -198,9 +198,7 @@ def continue_at_finite_strain(
 
 
 @blas_on_one_thread()
-def with_released(
-    inversion: Inversion, settings: InversionSettings, *, progress: Progress, rule: StopRule = NEAR
-) -> OuterIterate | None:
+def with_released(inversion: Inversion, settings: InversionSettings, *, progress: Progress) -> OuterIterate | None:
     """The best minimum followed on with those blocks free that were held while it was sought (see `Block.released`).
 
     None where there is no such block, or no minimum to follow. Raises `EstimationError`s of solving; one that did not
@@ -212,7 +210,7 @@ def with_released(
         return None
     objective, evaluation = best.objective.released(best.minimum.evaluation, best.minimum.unknowns)
     start = replace(best, objective=objective, minimum=replace(best.minimum, evaluation=evaluation))
-    return minimised(start, settings.bounds, rule, progress=progress, title=f"with {' and '.join(causes)} free")
+    return minimised(start, settings.bounds, NEAR, progress=progress, title=f"with {' and '.join(causes)} free")
 
 
 def _with_reduced_bases(

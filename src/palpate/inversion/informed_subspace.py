@@ -100,7 +100,8 @@ class _Responses:
         """With those to the material modes at coefficients (n_modes,) of homogeneous tissues."""
         q = coefficients[: self.boundary.shape[1] - 1]
         values = np.asarray(self.boundary @ np.append(q, 1.0).astype(np.float32), dtype=np.float64)
-        return replace(self, material=self.system.single_material_responses(values, tolerance=SNAPSHOT))
+        material = self.system.material_responses(values, tolerance=SNAPSHOT, dtype=np.float32)
+        return replace(self, material=material)
 
     def seen(self, state: LaterState, coefficients: NDArray[np.float64]) -> FirstOrderModel:
         """What is observed of them, to first order around coefficients (n_modes,); moduli move nothing."""

@@ -112,7 +112,12 @@ class FiniteStrainModel:
         checked, amounts = checked_moduli(moduli, self.names), checked_coefficients(coefficients, self.n_modes)
         boundary = amounts[: self.constraint.n_modes]
         balance = self.balance(checked, amounts[self.constraint.n_modes :])
-        begin = np.zeros(3 * len(self.space.points)) if start is None else self._checked_start(start)
+        begin = np.zeros_like(self.space.points) if start is None else np.array(start, dtype=float)
+        if begin.shape != self.space.points.shape or not np.all(np.isfinite(begin)):
+            raise ConfigurationError(
+                f"the start has the shape {begin.shape}; give a finite displacement {self.space.points.shape} in mm"
+            )
+        begin = begin.ravel()
         free = self.constraint.free
         given = self.constraint.modes @ boundary + self.constraint.offset
         now = begin - np.asarray(free @ np.asarray(free.T @ begin))
@@ -187,13 +192,6 @@ class FiniteStrainModel:
         units = [of_ratio(ratio, self.elements.dilatation) for ratio in ratios.values()]
         mu, pointwise, mean = scale * (moduli[:, None] * np.array(units)).T[:, self.element_region]
         return Moduli(mu, pointwise, mean)
-
-    def _checked_start(self, start: Array) -> Array:
-        if start.shape != self.space.points.shape or not np.all(np.isfinite(start)):
-            raise ConfigurationError(
-                f"the start has the shape {start.shape}; give a finite displacement {self.space.points.shape} in mm"
-            )
-        return np.array(start, dtype=float).ravel()
 
 
 @dataclass(frozen=True, slots=True)

@@ -150,8 +150,22 @@ class Elements:
 
         def fill(part: slice) -> None:
             """Those of the elements `part`."""
-            foreseen = None if pressure is None else pressure[part]
-            result[part] = self._stiffness(displacement, part, moduli.part(part), foreseen)
+            F, own, weights = self.deformation(displacement, part), moduli.part(part), self.weights[part]
+            flat, (n, n_q) = F.reshape(-1, 3, 3), F.shape[:2]
+            volume, gradient = self.law.volume(flat).reshape(n, n_q), self.law.volume_gradient(flat)
+            foreseen = self._pressure(volume, own, weights, None if pressure is None else pressure[part])
+            tangent = self._tangent(flat, gradient, own, volume, foreseen)
+            tangent *= (self.volumes[part, None] * weights).reshape(-1, 1)
+            stacked = self._stacked(part)
+            by_second = tangent.reshape(n, n_q, 3, 3, 3, 3).transpose(0, 1, 3, 2, 4, 5).reshape(n, n_q, 27, 3)
+            half = by_second @ np.swapaxes(self.gradients[part], 2, 3)
+            blocks = stacked @ half.reshape(n, n_q * 3, 9 * n_a)
+            result[part] = blocks.reshape(n, n_a, 3, 3, n_a).transpose(0, 1, 4, 2, 3)
+            if np.any(own.mean):
+                weighted = gradient.reshape(n, n_q, 3, 3) * weights[:, :, None, None]
+                slope = stacked @ np.swapaxes(weighted, 2, 3).reshape(n, -1, 3)
+                size = self.volumes[part] * own.mean * self.law.bulk_stiffness((volume * weights).sum(axis=1))
+                result[part] += np.einsum("n,nai,nbk->nabik", size, slope, slope, optimize=True)
 
         mapped(fill, self._parts())
         return result.reshape(-1, 9)
@@ -175,27 +189,6 @@ class Elements:
             return np.broadcast_to(mean[:, None], volume.shape)
         points = self.law.bulk_pressure(volume.ravel()).reshape(volume.shape)
         return np.asarray(moduli.pointwise[:, None] * points + mean[:, None])
-
-    def _stiffness(self, displacement: Array, part: slice, moduli: Moduli, foreseen: Array | None) -> Array:
-        """Blocks (n, n_a, n_a, 3, 3) of the elements `part`."""
-        F = self.deformation(displacement, part)
-        flat, (n, n_q) = F.reshape(-1, 3, 3), F.shape[:2]
-        volume, gradient = self.law.volume(flat).reshape(n, n_q), self.law.volume_gradient(flat)
-        weights = self.weights[part]
-        tangent = self._tangent(flat, gradient, moduli, volume, self._pressure(volume, moduli, weights, foreseen))
-        tangent *= (self.volumes[part, None] * weights).reshape(-1, 1)
-        stacked, n_a = self._stacked(part), self.cells.shape[1]
-        by_second = tangent.reshape(n, n_q, 3, 3, 3, 3).transpose(0, 1, 3, 2, 4, 5).reshape(n, n_q, 27, 3)
-        half = by_second @ np.swapaxes(self.gradients[part], 2, 3)
-        blocks = stacked @ half.reshape(n, n_q * 3, 9 * n_a)
-        blocks = blocks.reshape(n, n_a, 3, 3, n_a).transpose(0, 1, 4, 2, 3)
-        if not np.any(moduli.mean):
-            return np.asarray(blocks)
-        slope = stacked @ np.swapaxes(gradient.reshape(n, n_q, 3, 3) * weights[:, :, None, None], 2, 3).reshape(
-            n, -1, 3
-        )
-        size = self.volumes[part] * moduli.mean * self.law.bulk_stiffness((volume * weights).sum(axis=1))
-        return np.asarray(blocks + np.einsum("n,nai,nbk->nabik", size, slope, slope, optimize=True))
 
     def _tangent(self, flat: Array, gradient: Array, moduli: Moduli, volume: Array, pressure: Array) -> Array:
         """dP/dF (n * n_q, 81) kPa but for the part of the mean volume."""

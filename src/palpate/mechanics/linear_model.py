@@ -7,8 +7,8 @@ K_ff z = F^T f - F^T K (M q + o) with K_ff = F^T K F and dead loads f.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -234,16 +234,25 @@ class LinearSystem:
         return np.stack(np.split(np.asarray(solution), len(chosen), axis=1))
 
     def material_responses(
-        self, values: NDArray[np.float64], directions: NDArray[np.float64] | None = None, *, tolerance: float = EXACT
-    ) -> NDArray[np.float64]:
+        self,
+        values: NDArray[np.float64],
+        directions: NDArray[np.float64] | None = None,
+        *,
+        tolerance: float = EXACT,
+        dtype: type = np.float64,
+    ) -> NDArray[Any]:
         """Derivatives du / dc_k (n_dof, n_material) mm at an equilibrium u (n_dof,) mm of homogeneous tissues.
 
-        directions (n_material, k): sums of them instead; tolerance: of the relative residual.
+        directions (n_material, k): sums of them instead; tolerance: of the relative residual; dtype: of the result,
+        which is made some columns at a time.
         """
         along = np.eye(self.model.material.n_modes) if directions is None else directions
-        found = np.zeros((len(values), along.shape[1]))
-        for some, responses in self._material_responses(values, along, tolerance):
-            found[:, some] = responses
+        free, by_material = self.model.constraint.free, self.model.by_material(self.moduli, values)
+        found: NDArray[Any] = np.zeros((len(values), along.shape[1]), dtype=dtype)
+        for start in range(0, along.shape[1], AT_ONCE):
+            some = slice(start, start + AT_ONCE)
+            forces = np.asarray(free.T @ by_material.along(along[:, some]))
+            found[:, some] = free @ self.factorisation.solve(-forces, tolerance=tolerance)
         return found
 
     def single_responses(self, *, tolerance: float = EXACT) -> NDArray[np.float32]:
@@ -258,26 +267,6 @@ class LinearSystem:
             solution = self.factorisation.solve(some, tolerance=tolerance)
             found[:, start : start + AT_ONCE] -= np.asarray(constraint.free @ solution, dtype=np.float32)
         return found
-
-    def single_material_responses(
-        self, values: NDArray[np.float64], *, tolerance: float = EXACT
-    ) -> NDArray[np.float32]:
-        """As `material_responses` at u (n_dof,) mm, in single precision, some modes at a time."""
-        each = np.eye(self.model.material.n_modes)
-        found = np.zeros((len(values), len(each)), dtype=np.float32)
-        for some, responses in self._material_responses(values, each, tolerance):
-            found[:, some] = responses
-        return found
-
-    def _material_responses(
-        self, values: NDArray[np.float64], along: NDArray[np.float64], tolerance: float
-    ) -> Iterator[tuple[slice, NDArray[np.float64]]]:
-        """Some columns at a time of the responses (n_dof, k) at u (n_dof,) mm along directions (n_material, k)."""
-        free, by_material = self.model.constraint.free, self.model.by_material(self.moduli, values)
-        for start in range(0, along.shape[1], AT_ONCE):
-            some = slice(start, start + AT_ONCE)
-            forces = np.asarray(free.T @ by_material.along(along[:, some]))
-            yield some, np.asarray(free @ self.factorisation.solve(-forces, tolerance=tolerance))
 
     def solve(self, coefficients: NDArray[np.float64]) -> LinearEquilibrium:
         """Equilibrium at coefficients (n_modes,), dimensionless: one right-hand side, or two with material modes."""

@@ -15,16 +15,14 @@ INVERTED_DEG = -60.0  # what an inverted tetrahedron's angles count as
 TRIALS = 12
 
 
-def smoothed(
-    grid: Grid, contacts: Contacts, *, step_mm: float, sweeps: int, below_deg: float = 20.0, seed: int = 0
-) -> Grid:
+def smoothed(grid: Grid, contacts: Contacts, *, step_mm: float, sweeps: int, below_deg: float = 20.0) -> Grid:
     """Move the nodes of bad tetrahedra to where sum exp(-angle / 4 deg) over the tetrahedra around them is least.
 
     A pattern search for many nodes at a time, no two of which share a tetrahedron: interior nodes are free, those of
     the box stay on its faces, those of surfaces slide on them. Only improvements are kept, so nothing gets inverted.
-    Bad is an angle under `below_deg`; `step_mm` is the first step's length; `seed` that of the search directions.
+    Bad is an angle under `below_deg`; `step_mm` is the first step's length.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     nodes = grid.nodes.copy()
     count = len(grid.tets)
     star = sparse.csr_matrix(

@@ -134,13 +134,13 @@ def snapped(grid: Grid, contacts: Contacts, *, limit_mm: float, sweeps: int = 3)
     return grid
 
 
-def debiased(grid: Grid, contacts: Contacts, *, sweeps: int = 3) -> tuple[Grid, Contacts]:
+def debiased(grid: Grid, contacts: Contacts) -> tuple[Grid, Contacts]:
     """Move surface nodes until the level set's mean over the facets around each, weighted by its hat, vanishes.
 
     Chords of a curved surface lie on its inner side: with nodes on the surface every convex organ is too small.
     Returns the grid and the contacts with the targets that it was given.
     """
-    for _ in range(sweeps):
+    for _ in range(3):
         corners = grid.nodes[contacts.faces]
         area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         total, weight = np.zeros(contacts.on.shape), np.zeros(contacts.on.shape)

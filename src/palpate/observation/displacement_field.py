@@ -168,10 +168,15 @@ def _transform(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         grid = min(reversed(images.values()), key=lambda image: float(np.prod(image.GetSpacing())))
         _refuse_many(grid.GetSize(), path)
         whole, affine = _of_itk(sitk, _on(sitk, transform, grid))
+        index = np.moveaxis(np.indices(whole.shape[:3]), 0, -1)
+        points = (index @ affine[:3, :3].T + affine[:3, 3]) * LPS_TO_RAS
         for n, image in images.items():
             first = [sitk.Transform(3, sitk.sitkIdentity), *parts[n + 1 :]]  # the last one is applied first
             moved, _ = _of_itk(sitk, _on(sitk, sitk.CompositeTransform(first), grid))
-            whole[~_within(image, moved, affine)] = np.nan
+            axes = np.array(image.GetDirection()).reshape(3, 3) * np.array(image.GetSpacing())
+            place = (points + moved - np.array(image.GetOrigin())) @ np.linalg.inv(axes).T
+            inside = np.all((place > -ROUNDING) & (place < np.array(image.GetSize()) - 1.0 + ROUNDING), axis=-1)
+            whole[~inside] = np.nan
         if np.isnan(whole).all():
             raise InputDataError(
                 f"the {len(images)} fields of '{path}' have grids that no point's way keeps to; write the transform as"
@@ -186,15 +191,6 @@ def _on(sitk: Any, transform: Any, grid: Any) -> Any:
     """The displacement of a transform as an image on the grid of another."""
     size, origin, spacing, direction = grid.GetSize(), grid.GetOrigin(), grid.GetSpacing(), grid.GetDirection()
     return sitk.TransformToDisplacementField(transform, sitk.sitkVectorFloat64, size, origin, spacing, direction)
-
-
-def _within(image: Any, moved: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points (nx, ny, nz) of a grid with a RAS `affine`, displaced by (nx, ny, nz, 3) LPS mm, an image holds."""
-    index = np.moveaxis(np.indices(moved.shape[:3]), 0, -1)
-    points = (index @ affine[:3, :3].T + affine[:3, 3]) * LPS_TO_RAS + moved
-    axes = np.array(image.GetDirection()).reshape(3, 3) * np.array(image.GetSpacing())
-    place = (points - np.array(image.GetOrigin())) @ np.linalg.inv(axes).T
-    return np.asarray(np.all((place > -ROUNDING) & (place < np.array(image.GetSize()) - 1.0 + ROUNDING), axis=-1))
 
 
 def _of_itk(sitk: Any, image: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import igl
 import numpy as np
@@ -38,31 +38,6 @@ class Correspondence:
         return values if self.shown is None else np.asarray(values[self.shown])
 
 
-@dataclass(frozen=True, slots=True)
-class _Closest:
-    """Closest points of the deformed surface to the image's: triangle (n,), barycentric (n, 3), places (n, 3) mm."""
-
-    triangle: NDArray[np.int64]
-    barycentric: NDArray[np.float64]
-    places: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class _Direction:
-    """Residuals (n,) of one direction of the distance, as `Residuals` has them.
-
-    corners (n, 3): vertices of the triangle of each; by_corners (n, 3 corners, 3 axes): derivatives by their motion.
-    """
-
-    values: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    places: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    material: NDArray[np.float64]
-    corners: NDArray[np.int64]
-    by_corners: NDArray[np.float64]
-
-
 def surface_residuals(target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence) -> Residuals:
     """Residuals and their derivative at a displacement (n_vertices, 3) mm of the surface's points.
 
@@ -73,28 +48,21 @@ def surface_residuals(target: SurfaceTarget, displacement: NDArray[np.float64], 
     vertices = target.surface.rest + displacement
     normals = vertex_normals(vertices, target.surface.triangles)
     both = (_model_to_image(target, vertices, normals, held), _image_to_model(target, vertices, normals, held))
-    corners = np.concatenate([d.corners for d in both])
+    *found, corners, by_corners = (np.concatenate(parts) for parts in zip(*both, strict=True))
     columns = (3 * corners[:, :, None] + np.arange(3)).ravel()
     starts, shape = 9 * np.arange(len(corners) + 1), (len(corners), 3 * len(vertices))
-    by_corners = np.concatenate([d.by_corners for d in both])
-    return Residuals(
-        np.concatenate([d.values for d in both]),
-        np.concatenate([d.weights for d in both]),
-        np.concatenate([d.places for d in both]),
-        np.concatenate([d.normals for d in both]),
-        np.concatenate([d.material for d in both]),
-        sparse.csr_matrix((by_corners.ravel(), columns, starts), shape=shape),
-    )
+    values, weights, places, normals, material = found
+    jacobian = sparse.csr_matrix((by_corners.ravel(), columns, starts), shape=shape)
+    return Residuals(values, weights, places, normals, material, jacobian)
 
 
 def correspondence(target: SurfaceTarget, displacement: NDArray[np.float64]) -> Correspondence:
     """Of a displacement (n_vertices, 3) mm: which points of either surface are compared; the excess."""
     surface, vertices = target.surface, target.surface.rest + displacement
-    closest = _closest(surface, vertices, target.image_points)
-    at_rim = np.any((closest.barycentric < ON_EDGE) & surface.rim[closest.triangle], axis=1)
-    corners = surface.triangles[closest.triangle]
-    normals = _within(vertex_normals(vertices, surface.triangles), corners, closest.barycentric)
-    kept = surface.observed[closest.triangle] & ~at_rim
+    triangle, barycentric, _ = _closest(surface, vertices, target.image_points)
+    at_rim = np.any((barycentric < ON_EDGE) & surface.rim[triangle], axis=1)
+    normals = _within(vertex_normals(vertices, surface.triangles), surface.triangles[triangle], barycentric)
+    kept = surface.observed[triangle] & ~at_rim
     if target.voxels is None:  # exact maps: nothing is smoothed, and they are made of plane pieces themselves
         excess = np.zeros(len(surface.rest))
     else:
@@ -142,8 +110,12 @@ def _bulge(surface: ObservedSurface, displacement: NDArray[np.float64]) -> NDArr
 
 def _model_to_image(
     target: SurfaceTarget, vertices: NDArray[np.float64], normals: NDArray[np.float64], held: Correspondence
-) -> _Direction:
-    """Of the deformed vertices (n_vertices, 3) mm with unit normals (n_vertices, 3)."""
+) -> tuple[NDArray[Any], ...]:
+    """Residuals of the deformed vertices (n_vertices, 3) mm with unit normals (n_vertices, 3).
+
+    As `Residuals` has them: values, weights, places, normals, material places (n, ...). Then the vertices (n, 3) of the
+    triangle of each, and the derivatives (n, 3 corners, 3 axes) by their motion.
+    """
     barycentric, area = held.of_model(target.barycentric), held.of_model(target.area)
     corners = target.surface.triangles[held.of_model(target.triangle)]
     material, places = (places_within(of[corners], barycentric) for of in (target.surface.rest, vertices))
@@ -154,29 +126,29 @@ def _model_to_image(
     by_corners = barycentric[:, :, None] * (slope[:, None] * normal)[:, None]
     values = distance - held.of_model(target.rest_distance) - excess
     weights = 0.5 * area / max(float(area.sum()), 1e-30)
-    return _Direction(values, weights, places, normal, material, corners, by_corners)
+    return values, weights, places, normal, material, corners, by_corners
 
 
 def _image_to_model(
     target: SurfaceTarget, vertices: NDArray[np.float64], normals: NDArray[np.float64], held: Correspondence
-) -> _Direction:
-    """Of the deformed vertices (n_vertices, 3) mm with unit normals (n_vertices, 3)."""
+) -> tuple[NDArray[Any], ...]:
+    """As `_model_to_image`, of the image's points."""
     surface, kept = target.surface, held.kept
     image = target.image_points[kept]
-    closest = _closest(surface, vertices, image)
-    corners = surface.triangles[closest.triangle]
-    offset = closest.places - image
+    triangle, barycentric, places = _closest(surface, vertices, image)
+    corners = surface.triangles[triangle]
+    offset = places - image
     plane = triangle_normals(vertices, surface.triangles)
-    plane = (plane / np.maximum(_length(plane), 1e-30)[:, None])[closest.triangle]
+    plane = (plane / np.maximum(_length(plane), 1e-30)[:, None])[triangle]
     length = _length(offset)
     side = np.where(np.einsum("na,na->n", offset, plane) < 0.0, -1.0, 1.0)
-    material = places_within(surface.rest[corners], closest.barycentric)
-    excess = np.einsum("nk,nk->n", closest.barycentric, held.excess[corners])
-    normal = _within(normals, corners, closest.barycentric)
-    by_corners = closest.barycentric[:, :, None] * normal[:, None]
+    material = places_within(surface.rest[corners], barycentric)
+    excess = np.einsum("nk,nk->n", barycentric, held.excess[corners])
+    normal = _within(normals, corners, barycentric)
+    by_corners = barycentric[:, :, None] * normal[:, None]
     weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
     values = side * length - (target.before.at(material) - target.level) - excess
-    return _Direction(values, weights, closest.places, normal, material, corners, by_corners)
+    return values, weights, places, normal, material, corners, by_corners
 
 
 def _within(
@@ -192,7 +164,10 @@ def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(np.einsum("na,na->n", vectors, vectors)))
 
 
-def _closest(surface: ObservedSurface, vertices: NDArray[np.float64], image: NDArray[np.float64]) -> _Closest:
+def _closest(
+    surface: ObservedSurface, vertices: NDArray[np.float64], image: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Points of the deformed surface closest to the image's: triangle (n,), barycentric (n, 3), places (n, 3) mm."""
     triangles = np.ascontiguousarray(surface.triangles)
     _, triangle, places = igl.point_mesh_squared_distance(np.ascontiguousarray(image), vertices, triangles)[:3]
     corner = vertices[triangles[triangle]]
@@ -205,4 +180,4 @@ def _closest(surface: ObservedSurface, vertices: NDArray[np.float64], image: NDA
     barycentric = np.clip(barycentric, 0.0, 1.0)
     barycentric[barycentric < ON_EDGE] = 0.0
     barycentric /= barycentric.sum(axis=1, keepdims=True)
-    return _Closest(np.asarray(triangle, dtype=np.int64), barycentric, np.asarray(places))
+    return np.asarray(triangle, dtype=np.int64), barycentric, np.asarray(places)

@@ -79,16 +79,16 @@ def posterior_chains(
         now = start + SPREAD * laplace.draws(1, generator)[0]
         inside = np.clip(start[:n] + stretch @ (now[:n] - start[:n]), bounds.lower, bounds.upper)
         now[:n] = start[:n] + SHRUNK * np.linalg.solve(stretch, inside - start[:n])
-        parts = []
+        parts, accepted = [], 0
         for done in range(0, warm + steps, BLOCK):
             several = min(BLOCK, warm + steps - done)
-            parts.append(_chain(straight, laplace, now, bounds=bounds, steps=several, rng=generator, stretch=stretch))
-            now = parts[-1].end
-        kept = slice(warm + THIN - 1, None, THIN)
-        theta = np.concatenate([part.theta for part in parts])[kept]
-        density = -np.concatenate([part.energy for part in parts])[kept]
-        accepted = sum(part.accepted for part in parts) / (warm + steps)
-        found.append((theta, density, accepted))
+            *part, now, taken = _chain(
+                straight, laplace, now, bounds=bounds, steps=several, rng=generator, stretch=stretch
+            )
+            parts.append(part)
+            accepted += taken
+        theta, energy = (np.concatenate(each)[warm + THIN - 1 :: THIN] for each in zip(*parts, strict=True))
+        found.append((theta, -energy, accepted / (warm + steps)))
     thetas, densities, shares = zip(*found, strict=True)
     return PosteriorChains(np.stack(thetas), np.stack(densities), np.array(shares))
 
@@ -141,19 +141,6 @@ class _Laplace:
         return np.asarray(linalg.solve_triangular(self.factor.T, normal, lower=False).T)
 
 
-@dataclass(frozen=True, slots=True)
-class _Stretch:
-    """Of a chain: its log-moduli (steps, n_parameters), minus their log-density (steps,), its end (n,) before it.
-
-    That is before log-moduli are stretched; accepted: how many proposals it took.
-    """
-
-    theta: NDArray[np.float64]
-    energy: NDArray[np.float64]
-    end: NDArray[np.float64]
-    accepted: int
-
-
 def _chain(
     straight: _Straight,
     laplace: _Laplace,
@@ -163,8 +150,12 @@ def _chain(
     steps: int,
     rng: np.random.Generator,
     stretch: NDArray[np.float64],
-) -> _Stretch:
-    """So many steps from unknowns z (n,); `stretch` (n_parameters, n_parameters): A of `posterior_chains`."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], int]:
+    """So many steps from unknowns z (n,); `stretch` (n_parameters, n_parameters): A of `posterior_chains`.
+
+    Their log-moduli (steps, n_parameters), minus their log-density (steps,) before log-moduli are stretched, the end
+    (n,), and how many proposals were taken.
+    """
     centre = laplace.centre[: len(stretch)]
     n = len(centre)
     theta, energy, accepted = np.empty((steps, n)), np.empty(steps), 0
@@ -180,4 +171,4 @@ def _chain(
             if thresholds[k] < level - above:
                 now, value, level, accepted = trial, there, above, accepted + 1
         theta[k], energy[k] = centre + stretch @ (now[:n] - centre), value
-    return _Stretch(theta, energy, now, accepted)
+    return theta, energy, now, accepted
