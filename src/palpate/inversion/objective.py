@@ -116,7 +116,7 @@ class Objective:
     - ln p(h) + 1/2 ln det H. The unknowns x, their prior mean m and precision P are those of `parameters`. h: the
     scales s_k of the observations' `weighting`, the blocks' covariance P^-1, and the numbers of the alternatives
     that are `chosen` for them, with their odds as p(h); the last term integrates over x by Laplace's approximation, H =
-    J^T W J + P. A call gives what depends on x at these h, `log_terms` the rest. Each observation has an offset, where
+    J^T W J + P. A call gives what depends on x at these h, `total` all of it. Each observation has an offset, where
     `parameters` have one. learn_last: whether the blocks that are learned last have a choice yet.
     """
 
@@ -130,8 +130,8 @@ class Objective:
         """Number of log-moduli among the unknowns."""
         return self.parameters.n_parameters
 
-    def log_terms(self, evaluation: Evaluation) -> float:
-        """What J has beside an evaluation's value: ln Z of the residuals, ln det P, ln p(h), ln det H."""
+    def total(self, evaluation: Evaluation) -> float:
+        """J, dimensionless, where it was evaluated: with ln Z of the residuals, ln det P, ln p(h), ln det H."""
         pairs = zip(self.parameters.blocks, self.chosen, strict=False)
         odds = [block.odds[c] for block, c in pairs if block.odds and c is not None]
         residuals = sum(o.weighting.log_normaliser for o in self.observations)
@@ -142,7 +142,7 @@ class Objective:
         normal, beyond = self.as_normal(evaluation)
         n = self.n_parameters
         determinants = log_det(evaluation.matrix - evaluation.prior + normal) - log_det(normal[n:, n:])
-        return residuals + beyond - sum(odds) + 0.5 * determinants
+        return evaluation.value + (residuals + beyond - sum(odds) + 0.5 * determinants)
 
     def as_normal(self, evaluation: Evaluation) -> tuple[NDArray[np.float64], float]:
         """Precision P (n_unknowns, n_unknowns) for the determinants; what J has beside the normal laws of `parameters`.
@@ -160,10 +160,6 @@ class Objective:
                 normal = normal.copy()
                 normal[np.ix_(own, own)] = block.precision
         return normal, beyond
-
-    def total(self, evaluation: Evaluation) -> float:
-        """J, dimensionless, where it was evaluated."""
-        return evaluation.value + self.log_terms(evaluation)
 
     @property
     def observations(self) -> list[Observation]:

@@ -142,19 +142,13 @@ class LinearModel:
             total += modulus * (matrix @ displacements)
         return total
 
-    def tangent_loads(self, moduli: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Loads (n_free, n_regions + n_modes), mN, whose responses are the free part of the tangent.
-
-        At an equilibrium u (n_dof,) mm and moduli (n_regions,) kPa.
-        """
-        forces = self.by_material(moduli, values).along(np.eye(self.material.n_modes))
-        material = -np.asarray(self.constraint.free.T @ forces)
-        return np.concatenate([self.boundary_loads(moduli, values), material], axis=1)
-
     def boundary_loads(
         self, moduli: NDArray[np.float64], values: NDArray[np.float64], directions: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Those loads (n_free, k), mN, by moduli and boundary modes alone; directions (n_regions + n_boundary, k)."""
+        """Loads (n_free, k), mN, whose responses are the free part of the tangent by moduli and boundary modes.
+
+        At an equilibrium u (n_dof,) mm and moduli (n_regions,) kPa; directions (n_regions + n_boundary, k).
+        """
         pairs, free = zip(moduli, self.stiffness, strict=True), self.constraint.free
         forces = [modulus * np.asarray(free.T @ np.asarray(matrix @ values)) for modulus, matrix in pairs]
         by_modulus, by_mode = np.stack(forces, axis=1), weighted_sum(moduli, self.coupling)[:, :-1]
@@ -323,10 +317,12 @@ class LinearEquilibrium(DenseEquilibrium):
 
     def tangent(self) -> NDArray[np.float64]:
         """T (n_dof, n_regions + n_modes), mm: columns du / d ln E_r = -F K_ff^-1 F^T E_r K_r u, then du / dq_k."""
-        constraint = self.system.model.constraint
-        solution = self.system.factorisation.solve(self.system.model.tangent_loads(self.system.moduli, self.values))
-        tangent = np.asarray(constraint.free @ solution)
-        first = self.system.model.n_regions
+        model, moduli, constraint = self.system.model, self.system.moduli, self.system.model.constraint
+        forces = model.material_forces(moduli, self.values, np.eye(model.material.n_modes))
+        material = -np.asarray(constraint.free.T @ forces)
+        loads = np.concatenate([model.boundary_loads(moduli, self.values), material], axis=1)
+        tangent = np.asarray(constraint.free @ self.system.factorisation.solve(loads))
+        first = model.n_regions
         tangent[:, first : first + constraint.n_modes] += constraint.modes
         return tangent
 

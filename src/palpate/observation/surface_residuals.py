@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from palpate.images.distance import terrace_noise
 from palpate.mesh.surface import mean_curvature, triangle_normals, vertex_normals
 from palpate.observation.contract import Residuals
 from palpate.observation.observed_surface import ObservedSurface
@@ -64,12 +65,15 @@ def correspondence(target: SurfaceTarget, displacement: NDArray[np.float64]) -> 
     normals = _within(vertex_normals(vertices, surface.triangles), surface.triangles[triangle], barycentric)
     kept = surface.observed[triangle] & ~at_rim
     if target.voxels is None:  # exact maps: nothing is smoothed, and they are made of plane pieces themselves
-        excess = np.zeros(len(surface.rest))
+        excess, terraces = np.zeros(len(surface.rest)), np.zeros(len(normals))
     else:
         widths = tuple(distance.smoothing_mm for distance in target.voxels)
         excess = _shrinkage(surface, displacement, widths) - _bulge(surface, displacement)
+        # along the model's normals: the image's are noisy with the same rounding, and weights that go with the errors
+        # of what they weigh bias it
+        terraces = terrace_noise(*target.voxels, normals)
     shown = None if target.view is None else target.shown(displacement)
-    return Correspondence(kept, target.terraces_along(normals), excess, shown)
+    return Correspondence(kept, terraces, excess, shown)
 
 
 def _shrinkage(

@@ -62,7 +62,8 @@ def posterior_chains(
     """
     n, parameters = frozen.objective.n_parameters, frozen.objective.parameters
     straight = _Straight(frozen, parameters.acting_on_moduli, parameters.shares_on_moduli)
-    slopes, start = straight.slopes(start), straight.straightened(start)
+    slopes, start = straight.slopes(start), start.copy()
+    start[straight.columns] = in_series(start[straight.columns], straight.shares)
     try:
         laplace = _Laplace(start, linalg.cholesky(evaluation.matrix / np.outer(slopes, slopes), lower=True))
     except linalg.LinAlgError as error:
@@ -105,12 +106,6 @@ class _Straight:
         """Derivatives dz / dx (n_unknowns,) at unknowns x (n_unknowns,)."""
         found = np.ones(len(unknowns))
         found[self.columns] = in_series_slopes(unknowns[self.columns], self.shares)
-        return found
-
-    def straightened(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The z (n_unknowns,) of x (n_unknowns,)."""
-        found = unknowns.copy()
-        found[self.columns] = in_series(unknowns[self.columns], self.shares)
         return found
 
     def energy(self, straight: NDArray[np.float64]) -> tuple[float, float]:

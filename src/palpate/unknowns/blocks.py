@@ -91,11 +91,6 @@ class Block:
             )
 
     @property
-    def first_precision(self) -> NDArray[np.float64]:
-        """Precision (n, n) with which an estimate begins."""
-        return CONSIDERED * self.precision if self.considered or self.released else self.precision
-
-    @property
     def size(self) -> int:
         """Number of its unknowns."""
         return len(self.precision)
@@ -292,10 +287,10 @@ def of_series(y: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np
 
 
 def joined(blocks: Sequence[Block]) -> NDArray[np.float64]:
-    """Precision (n, n) of the unknowns of several blocks, one after the other."""
+    """Precision (n, n) with which an estimate of the unknowns of several blocks begins, one after the other."""
     total = sum(block.size for block in blocks)
     matrix, start = np.zeros((total, total)), 0
     for block in blocks:
-        end = start + block.size
-        matrix[start:end, start:end], start = block.first_precision, end
+        end, held = start + block.size, block.considered or block.released
+        matrix[start:end, start:end], start = CONSIDERED * block.precision if held else block.precision, end
     return matrix

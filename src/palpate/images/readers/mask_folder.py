@@ -7,10 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.images.label_image import corners_apart
@@ -62,7 +60,16 @@ def read_mask_folder(folder: Path) -> StoredImage:
                 )
             for part, digest in image.digests.items():
                 digests[f"{file.file}.{part}" if part else file.file] = digest
-            yield Mask(file.row, _inside(image.values, file.target))
+            labels = label_values(image.values, file.target)
+            inside, high = labels > 0, int(labels.max())  # those that are not zero have one value, whichever it is
+            others = int(np.count_nonzero(inside & (labels != high)))
+            if others:
+                raise InputDataError(
+                    f"'{file.target}' is no mask of one organ: of its {np.count_nonzero(inside)} voxels that are not"
+                    f" 0, {others} have another value than {high}; a mask has 0 and one other value. Name a label image"
+                    " by itself, not in a folder of masks"
+                )
+            yield Mask(file.row, inside)
 
     labels, findings = merged(masks(), first.values.shape)
     return StoredImage(labels, first.affine, tuple(file.row for file in files), digests, findings)
@@ -127,21 +134,6 @@ def _read(file: _MaskFile) -> StoredImage:
             " name that file as the image, or take it out of the folder"
         )
     return image
-
-
-def _inside(values: NDArray[Any], path: Path) -> NDArray[np.bool_]:
-    """The voxels of a mask: those that are not zero, which have one value, whichever it is."""
-    labels = label_values(values, path)
-    inside = labels > 0
-    high = int(labels.max())
-    others = int(np.count_nonzero(inside & (labels != high)))
-    if others:
-        raise InputDataError(
-            f"'{path}' is no mask of one organ: of its {np.count_nonzero(inside)} voxels that are not 0, {others} have"
-            f" another value than {high}; a mask has 0 and one other value. Name a label image by itself, not in a"
-            " folder of masks"
-        )
-    return inside
 
 
 register(ImageFormat("a folder of masks", (FOLDER,), read_mask_folder, patience=4))
