@@ -48,7 +48,15 @@ def graded_grid(
         too_large = edge_lengths(grid).max(axis=1) > size(grid.nodes[grid.tets].mean(axis=1))
         if not too_large.any():
             break
-        grid = _bisected(grid, too_large)
+        pairs = np.sort(grid.tets[:, TET_EDGES], axis=2)
+        keys, number = np.unique(pairs[..., 0] * len(grid.nodes) + pairs[..., 1], return_inverse=True)
+        number = number.reshape(-1, 6)
+        longest = np.take_along_axis(number, edge_lengths(grid).argmax(axis=1)[:, None], axis=1)[:, 0]
+        marked, reached = np.zeros(len(keys), dtype=bool), longest[too_large]
+        while not marked[reached].all():  # and others, where that keeps the grid conforming and good
+            marked[reached] = True
+            reached = longest[marked[number].any(axis=1)]
+        grid, _ = _divide(grid, marked[number], lambda nodes, ends: nodes[ends].mean(axis=1))
     return grid
 
 
@@ -89,7 +97,7 @@ def cut(
     ends = grid.tets[:, TET_EDGES]
     crossed = np.prod(np.sign(values[ends]), axis=2) < 0
     moved = Grid(nodes, grid.tets, grid.region)
-    divided, parent = _divide(moved, crossed, lambda pairs: _roots(nodes[pairs], values[pairs], phi))
+    divided, parent = _divide(moved, crossed, lambda nodes, ends: _roots(nodes[ends], values[ends], phi))
     values = np.concatenate([values, np.zeros(len(divided.nodes) - len(values))])
     total = values[divided.tets].sum(axis=1)
     flat = np.flatnonzero((total == 0.0) & splittable[parent])
@@ -122,27 +130,12 @@ def face_pieces(tets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
     return np.asarray(piece, dtype=np.int64), np.asarray(count, dtype=np.int64)
 
 
-def _bisected(grid: Grid, chosen: NDArray[np.bool_]) -> Grid:
-    """Bisect the chosen tetrahedra at their longest edge, and others where that keeps the grid conforming and good."""
-    n = len(grid.nodes)
-    pairs = np.sort(grid.tets[:, TET_EDGES], axis=2)
-    keys, number = np.unique(pairs[..., 0] * n + pairs[..., 1], return_inverse=True)
-    number = number.reshape(-1, 6)
-    longest = np.take_along_axis(number, edge_lengths(grid).argmax(axis=1)[:, None], axis=1)[:, 0]
-    marked = np.zeros(len(keys), dtype=bool)
-    marked[longest[chosen]] = True
-    while True:
-        reached = longest[marked[number].any(axis=1)]
-        if marked[reached].all():
-            break
-        marked[reached] = True
-    return _divide(grid, marked[number], lambda ends: grid.nodes[ends].mean(axis=1))[0]
-
-
 def _divide(
-    grid: Grid, marked: NDArray[np.bool_], place: Callable[[NDArray[np.int64]], NDArray[np.float64]]
+    grid: Grid,
+    marked: NDArray[np.bool_],
+    place: Callable[[NDArray[np.float64], NDArray[np.int64]], NDArray[np.float64]],
 ) -> tuple[Grid, NDArray[np.int64]]:
-    """Divide every marked edge (n_tets, 6) at `place` (edge ends (n, 2) -> (n, 3) mm); also the parent of each child.
+    """Divide every marked edge (n_tets, 6) at `place` (nodes and ends (n, 2) -> (n, 3) mm); the parent of each child.
 
     In each tetrahedron the longest marked edge goes first. That order is the same on both sides of a face, so the
     result conforms.
@@ -155,7 +148,7 @@ def _divide(
     keys, first = np.unique(pairs[:, 0] * n + pairs[:, 1], return_index=True)
     rank = np.empty(len(keys), dtype=np.int64)
     rank[np.argsort(-np.round(length[first], 6), kind="stable")] = np.arange(len(keys))
-    nodes = np.concatenate([grid.nodes, place(np.stack([keys // n, keys % n], axis=1))])
+    nodes = np.concatenate([grid.nodes, place(grid.nodes, np.stack([keys // n, keys % n], axis=1))])
     tets, parent = grid.tets, np.arange(len(grid.tets))
     done: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
     while len(tets):

@@ -12,7 +12,7 @@ import math
 import os
 from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,20 @@ def read_nifti(path: Path) -> StoredImage:
             is_and_should = ("is compressed", ".nii.gz") if zipped else ("is not compressed by gzip", ".nii")
             raise InputDataError(f"'{path}' {is_and_should[0]}, against its ending; rename it to {is_and_should[1]}")
         stream = gzip_stream(file) if zipped else file
-        header, used = _header(stream, path)
+        content = read_exactly(stream, 348, path).tobytes()
+        lengths = {sign: int(np.frombuffer(content[:4], dtype=f"{sign}i4")[0]) for sign in ("<", ">")}
+        sign = next((sign for sign, length in lengths.items() if length in HEADERS), None)
+        if sign is None:
+            raise InputDataError(f"'{path}' does not begin as a NIfTI file does; export the image as NIfTI (.nii.gz)")
+        used = lengths[sign]
+        content += read_exactly(stream, used - len(content), path).tobytes()
+        magic = content[344:348] if used == 348 else content[4:12]
+        if magic != MAGIC[used]:
+            raise InputDataError(
+                f"'{path}' has the mark {magic!r}, which is not that of a NIfTI file in one piece; convert Analyze and"
+                " .hdr/.img pairs to .nii.gz"
+            )
+        header = getattr(import_module("nibabel"), HEADERS[used])(content, endianness=sign, check=False)
         block, slope, intercept = _block(header, path)
         affine = _affine(header, path)
         check_size(block.shape, block.skip + block.n_bytes, path, available=file.n_bytes, packed=zipped)
@@ -56,24 +69,6 @@ def read_nifti(path: Path) -> StoredImage:
             values = np.asarray(values * slope + intercept)
     names = extension_names(between, header.endianness, path)
     return StoredImage(values, affine, names, digests)
-
-
-def _header(stream: BinaryIO, path: Path) -> tuple[Any, int]:
-    """The decoded header and its length in bytes."""
-    block = read_exactly(stream, 348, path).tobytes()
-    for sign in ("<", ">"):
-        length = int(np.frombuffer(block[:4], dtype=f"{sign}i4")[0])
-        if length in HEADERS:
-            block += read_exactly(stream, length - len(block), path).tobytes()
-            magic = block[344:348] if length == 348 else block[4:12]
-            if magic == MAGIC[length]:
-                decode = getattr(import_module("nibabel"), HEADERS[length])
-                return decode(block, endianness=sign, check=False), length
-            raise InputDataError(
-                f"'{path}' has the mark {magic!r}, which is not that of a NIfTI file in one piece; convert Analyze and"
-                " .hdr/.img pairs to .nii.gz"
-            )
-    raise InputDataError(f"'{path}' does not begin as a NIfTI file does; export the image as NIfTI (.nii.gz)")
 
 
 def _block(header: Any, path: Path) -> tuple[VoxelBlock, float, float]:
