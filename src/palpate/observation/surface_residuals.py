@@ -49,12 +49,12 @@ def surface_residuals(target: SurfaceTarget, displacement: NDArray[np.float64], 
     vertices = target.surface.rest + displacement
     normals = vertex_normals(vertices, target.surface.triangles)
     both = (_model_to_image(target, vertices, normals, held), _image_to_model(target, vertices, normals, held))
-    *found, corners, by_corners = (np.concatenate(parts) for parts in zip(*both, strict=True))
+    found = [np.concatenate(pair) for pair in zip(*both, strict=True)]
+    values, weights, places, along, material, corners, by_corners = found
     columns = (3 * corners[:, :, None] + np.arange(3)).ravel()
     starts, shape = 9 * np.arange(len(corners) + 1), (len(corners), 3 * len(vertices))
-    values, weights, places, normals, material = found
     jacobian = sparse.csr_matrix((by_corners.ravel(), columns, starts), shape=shape)
-    return Residuals(values, weights, places, normals, material, jacobian)
+    return Residuals(values, weights, places, along, material, jacobian)
 
 
 def correspondence(target: SurfaceTarget, displacement: NDArray[np.float64]) -> Correspondence:
