@@ -205,13 +205,13 @@ class Projection:
         """
         snapshots = _checked(self.model, snapshots)
         lengths = np.linalg.norm(snapshots, axis=0)
-        rest = snapshots[:, lengths > 0.0] / lengths[lengths > 0.0]
+        fresh = snapshots[:, lengths > 0.0] / lengths[lengths > 0.0]
         for _ in range(2):  # once leaves the rounding of what it takes away
-            rest = rest - self.spanned(self.components(rest))
-        rest = rest[:, np.linalg.norm(rest, axis=0) > RANK_TOLERANCE]
-        if not rest.shape[1]:
+            fresh = fresh - self.spanned(self.components(fresh))
+        fresh = fresh[:, np.linalg.norm(fresh, axis=0) > RANK_TOLERANCE]
+        if not fresh.shape[1]:
             return self
-        fresh = orthonormal_basis(rest)
+        fresh = orthonormal_basis(fresh)
         fresh = orthonormal_basis(fresh - self.spanned(self.components(fresh)))
         model, old, blocks = self.model, self.reduced, []
         for matrix, block in zip(model.free_stiffness, old.stiffness, strict=True):
