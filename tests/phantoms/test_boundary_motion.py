@@ -9,13 +9,13 @@ from palpate.phantoms.scene import BoundaryMotion, displacements
 from palpate.phantoms.shapes import rotation_about
 from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy
 
-OPTIONS = SpheresOptions(seed=1, kind="pushed", truth_edge_mm=7.0, spacing_mm=(3.0, 3.0, 3.0))
+OPTIONS = SpheresOptions(seed=1, kind="pushed", truth_edge_mm=10.0, spacing_mm=(3.0, 3.0, 3.0))
 PULL = AffineMotion(np.diag([0.02, 0.0, -0.01]), np.zeros(3), np.array([0.5, 0.0, 1.0]))
 
 
 @pytest.fixture(scope="module")
 def space():
-    return lagrange_space(tetrahedralise(spheres_anatomy(OPTIONS), edge_length_mm=7.0), "P2")
+    return lagrange_space(tetrahedralise(spheres_anatomy(OPTIONS), edge_length_mm=10.0), "P2")
 
 
 def border(space):

@@ -1,3 +1,4 @@
+import dataclasses
 import functools
 
 import numpy as np
@@ -6,7 +7,7 @@ import pytest
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
 from palpate.phantoms.motion import smooth_field
-from palpate.phantoms.pelvis import PelvisOptions, pelvis
+from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy, pelvis_motions
 from palpate.phantoms.pelvis_shapes import draw_pelvis
 from palpate.phantoms.scene import centred_grid, grid_box
 from palpate.phantoms.shapes import Union
@@ -99,20 +100,30 @@ def test_outer_border_is_held():
     assert np.abs(np.abs(truth.space.points[outer]).max(axis=0) - [55.0, 60.0, 60.0]).max() < 1e-6
 
 
+PLAIN = PelvisOptions(seed=3, filling_mm=3.0, spacing_mm=(2.5, 2.5, 3))
+
+
 def test_wall_motion_does_not_depend_on_what_else_is_asked_for():
     field = smooth_field(np.random.default_rng(0), sd_mm=1.0, correlation_mm=20.0)
     points = 30.0 * field.at(directions(20))
-    plain = pelvis(PelvisOptions(seed=3, filling_mm=3.0, truth_edge_mm=12.0, spacing_mm=(2.5, 2.5, 3)))
-    assert plain.motions["rectum"].at(points) == pytest.approx(scene().motions["rectum"].at(points))
-    assert plain.moduli_kpa["prostate"] == scene().moduli_kpa["prostate"]
+    assert pelvis_motions(PLAIN)["rectum"].at(points) == pytest.approx(scene().motions["rectum"].at(points))
+    assert moduli(PLAIN)["prostate"] == scene().moduli_kpa["prostate"]
 
 
 def test_another_motion_moves_the_same_body():
-    options = PelvisOptions(seed=3, filling_mm=3.0, truth_edge_mm=12.0, spacing_mm=(2.5, 2.5, 3), motion_seed=1)
-    other = pelvis(options)
-    assert other.moduli_kpa == {name: scene().moduli_kpa[name] for name in other.moduli_kpa}
-    wall = other.mesh.boundary[other.mesh.beyond == other.mesh.tissue_index("rectum")]
-    points = other.space.points[np.unique(other.space.facets(wall))]
-    moved, before = other.motions["rectum"].at(points), scene().motions["rectum"].at(points)
+    options = dataclasses.replace(PLAIN, motion_seed=1)
+    assert moduli(options) == moduli(PLAIN)
+    points = 30.0 * directions(100)
+    for ours, theirs in zip(*(pelvis_anatomy(of).level_sets[:3] for of in (options, PLAIN)), strict=True):
+        assert np.array_equal(ours.at(points), theirs.at(points))
+    space = scene().space
+    wall = space.mesh.boundary[space.mesh.beyond == space.mesh.tissue_index("rectum")]
+    points = space.points[np.unique(space.facets(wall))]
+    moved, before = pelvis_motions(options)["rectum"].at(points), scene().motions["rectum"].at(points)
     assert np.linalg.norm(moved - before, axis=1).max() > 0.5
     assert np.linalg.norm(moved, axis=1).max() == pytest.approx(3.0, rel=0.3)
+
+
+def moduli(options):
+    """True modulus (kPa) of every meshed tissue, by name."""
+    return {tissue.name: tissue.youngs_modulus_kpa for tissue in pelvis_anatomy(options).tissues if tissue.meshed}

@@ -12,7 +12,7 @@ from palpate.phantoms.spheres import SPHERES_KINDS, SpheresOptions, spheres
 
 @functools.cache
 def scene(kind, noise=None):
-    return spheres(SpheresOptions(seed=4, kind=kind, truth_edge_mm=8.0, spacing_mm=(2.0, 2.0, 2.0), noise=noise))
+    return spheres(SpheresOptions(seed=4, kind=kind, truth_edge_mm=10.0, spacing_mm=(2.0, 2.0, 2.0), noise=noise))
 
 
 @pytest.mark.parametrize("kind", SPHERES_KINDS)
@@ -50,7 +50,7 @@ def test_squeezed_frame_keeps_its_volume_to_first_order():
 
 
 def test_noise_moves_both_images_apart_and_leaves_the_truth_alone():
-    clean, noisy = scene("tumour"), scene("tumour", Noise(0.4, 6.0))
+    clean, noisy = scene("pushed"), scene("pushed", Noise(0.4, 6.0))
     assert noisy.displacement == pytest.approx(clean.displacement, abs=1e-9)
     assert np.array_equal(clean.before.labels, imaged(clean.space, 0.0 * clean.displacement, clean.before.grid).labels)
     changed = [np.mean(a.labels != b.labels) for a, b in ((clean.before, noisy.before), (clean.after, noisy.after))]
@@ -58,15 +58,15 @@ def test_noise_moves_both_images_apart_and_leaves_the_truth_alone():
 
 
 def test_same_seed_gives_the_same_scene_and_another_seed_another():
-    again = spheres(SpheresOptions(seed=4, kind="pushed", truth_edge_mm=8.0, spacing_mm=(2.0, 2.0, 2.0)))
-    other = spheres(SpheresOptions(seed=5, kind="pushed", truth_edge_mm=8.0, spacing_mm=(2.0, 2.0, 2.0)))
+    again = spheres(SpheresOptions(seed=4, kind="pushed", truth_edge_mm=10.0, spacing_mm=(2.0, 2.0, 2.0)))
+    other = spheres(SpheresOptions(seed=5, kind="pushed", truth_edge_mm=10.0, spacing_mm=(2.0, 2.0, 2.0)))
     assert np.array_equal(again.after.labels, scene("pushed").after.labels)
     assert not np.array_equal(other.after.labels, again.after.labels)
 
 
 def test_too_large_a_push_and_unknown_names_are_refused():
     with pytest.raises(GeometryError, match="folds over"):
-        spheres(SpheresOptions(seed=1, kind="pushed", push_mm=25.0, truth_edge_mm=8.0))
+        spheres(SpheresOptions(seed=1, kind="pushed", push_mm=25.0, truth_edge_mm=12.0))
     with pytest.raises(ConfigurationError, match="kind is 'cubes'"):
         spheres(SpheresOptions(seed=1, kind="cubes"))
     with pytest.raises(ConfigurationError, match=r"names \['liver'\]"):
