@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -24,25 +26,30 @@ def error(found: RigidMotion, truth: RigidMotion) -> tuple[float, float]:
     return float(np.linalg.norm(wrong.apply(place) - place)), wrong.angle_deg
 
 
+@cache
+def fit_of_a_whole(skin):
+    """Of a body whose organs move with it."""
+    return aligned(body(STILL, skin=skin), body(ELSEWHERE, skin=skin, seed=1))
+
+
 @pytest.mark.parametrize("skin", [True, False])
 def test_a_body_that_moves_as_a_whole_is_found_to_fractions_of_a_voxel(skin):
-    fit = aligned(body(STILL, skin=skin), body(ELSEWHERE, skin=skin, seed=1))
+    fit = fit_of_a_whole(skin)
     shift, turn = error(fit.motion, ELSEWHERE)
     assert shift < 0.25
     assert turn < 0.8
     assert fit.rms_mm < 0.5
 
 
-@pytest.mark.parametrize("filling", [3.0, 6.0])
 @pytest.mark.parametrize("skin", [True, False])
-def test_organs_that_move_by_themselves_do_not_hide_the_motion_of_the_whole(filling, skin):
-    fit = aligned(body(STILL, skin=skin), body(ELSEWHERE, filling=filling, skin=skin, seed=1))
+def test_organs_that_move_by_themselves_do_not_hide_the_motion_of_the_whole(skin):
+    fit = aligned(body(STILL, skin=skin), body(ELSEWHERE, filling=6.0, skin=skin, seed=1))
     shift, turn = error(fit.motion, ELSEWHERE)
     assert shift < 1.2
     assert turn < 1.6
 
 
-@pytest.mark.parametrize("filling", [0.0, 3.0, 6.0])
+@pytest.mark.parametrize("filling", [0.0, 6.0])
 @pytest.mark.parametrize("skin", [True, False])
 def test_organs_that_move_by_themselves_are_no_motion_of_the_whole(filling, skin):
     fit = aligned(body(STILL, skin=skin), body(STILL, filling=filling, skin=skin, seed=1))
@@ -67,9 +74,10 @@ def test_images_in_worlds_of_their_own_are_laid_on_each_other():
 def test_the_motion_that_is_told_is_that_of_the_organs_wherever_the_world_begins():
     before, after = body(STILL), body(ELSEWHERE, seed=1)
     away = RigidMotion(np.eye(3), np.array([500.0, -300.0, 900.0]))
+    there = moved(before, away), moved(after, away)
     told = [
-        registration(first, surface_maps(first, second), aligned(first, second), by="surfaces").row("after")
-        for first, second in ((before, after), (moved(before, away), moved(after, away)))
+        registration(before, surface_maps(before, after), fit_of_a_whole(True), by="surfaces").row("after"),
+        registration(there[0], surface_maps(*there), aligned(*there), by="surfaces").row("after"),
     ]
     np.testing.assert_allclose(
         told[0]["translation_mm"], told[1]["translation_mm"], atol=0.4
