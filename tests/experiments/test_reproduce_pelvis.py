@@ -18,7 +18,7 @@ def pelvis() -> RealPelvis:
 
 @pytest.fixture(scope="module")
 def space(pelvis) -> LagrangeSpace:
-    return pelvis.space(14.0)
+    return pelvis.space(18.0)
 
 
 def test_the_filling_moves_the_wall_outwards_and_nothing_else(pelvis, space):
@@ -43,7 +43,7 @@ def test_every_part_of_the_table_is_made_once():
 
 
 def test_same_mesh_gives_the_moduli_back_where_the_driver_is_given():
-    surfaces, *_ = table2(Table2Settings(edge_mm=14.0, moduli_kpa=(50.0, 150.0))).jobs
+    surfaces, *_ = table2(Table2Settings(edge_mm=18.0, moduli_kpa=(50.0, 150.0))).jobs
     found = entries_of(surfaces.make("150 same_mesh", lambda _: None))
     assert max(abs(found[organ].error_percent) for organ in ORGANS) < 0.01
     assert {found[organ].verdict for organ in ORGANS} == {"identified"}
