@@ -20,6 +20,7 @@ from palpate.observation.contract import DataFile
 from palpate.observation.registry import SOURCES, SourceKind
 from palpate.report.collect import collect
 from palpate.report.methods import methods_text
+from palpate.study.case import DriverMotion, MeshSettings
 from palpate.study.case_data import CaseData
 from palpate.study.case_file import read_case
 from palpate.study.check import check_case
@@ -62,6 +63,7 @@ edge_length_mm = 7.0
 [discrepancy]
 heterogeneity_sd = 0.0
 poisson_sd = 0.0
+layer_sd = 0.0
 
 [noise]
 surface_sd_mm = 0.3
@@ -170,24 +172,23 @@ class Dot:
         return point_motion(point, space.points[point], np.zeros(3), sd_mm=self.file.sd_mm), ()
 
 
-def test_another_kind_is_one_file_and_one_line(case, registered):
-    """A corner of the held border: it tells nothing, which is said, and no layer asks what it is."""
+def test_another_kind_is_one_file_and_one_line_and_two_files_of_one_keep_their_own_errors(case, folder, registered):
+    """The first markers say nothing beside the second, which are a hundred times better; a held corner tells nothing.
+
+    Which is said of it, and no layer asks what it is.
+    """
     registered(SOURCES, "dot", SourceKind(Dot, needs=("sd_mm",), may_have=()))
-    result = estimate(replace(case, data=(CaseData("dot", sd_mm=0.1),)))
-    assert result.estimation.information_shares["core"]["point motion"] < 1e-12
+    vague, sharp = (CaseData("landmarks", folder / "markers.csv", sd_mm=sd) for sd in (10.0, 0.1))
+    coarse = replace(case, mesh=MeshSettings(9.0), driver=DriverMotion(modes=8))
+    result = estimate(replace(coarse, data=(vague, sharp, CaseData("dot", sd_mm=0.1))))
+    shares = result.estimation.information_shares["core"]
+    assert shares["landmarks"] < 1e-2 * shares["landmarks 2"]
+    assert shares["point motion"] < 1e-12
     assert result.estimation.fits[0][-1].tissue == "landmark"
-    assert result.estimation.points == ()  # it has nothing that could be drawn
+    assert len(result.estimation.points) == 2  # the dot has nothing that could be drawn
     assert "displacement of points" in " ".join(methods_text(collect(result)).paragraphs)
     with pytest.raises(ConfigurationError, match="has no 'force_n'"):
         CaseData("dot", sd_mm=0.1, force_n=1.0)
-
-
-def test_two_files_of_one_kind_keep_their_own_errors(case, folder):
-    """The first one says nothing beside the second, whose markers are a hundred times better."""
-    vague = CaseData("landmarks", folder / "markers.csv", sd_mm=10.0)
-    sharp = CaseData("landmarks", folder / "markers.csv", sd_mm=0.1)
-    shares = estimate(replace(case, data=(vague, sharp))).estimation.information_shares["core"]
-    assert shares["landmarks"] < 1e-2 * shares["landmarks 2"]
 
 
 @pytest.mark.usefixtures("case")

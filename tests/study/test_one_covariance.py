@@ -55,7 +55,7 @@ def without(twins, bodies, observed):
 
 @pytest.fixture(scope="module")
 def found(twins, bodies, observed):
-    return concluded(twins, bodies, observed, layers=True, samples=1000)
+    return concluded(twins, bodies, observed, layers=True, samples=500)
 
 
 def half_widths(intervals):
