@@ -63,7 +63,7 @@ def weighs(state, m_s2):
 
 def beam():
     """A straight beam of P1 tetrahedra, clamped where x is 0."""
-    nodes, tets = box_cells((12, 3, 3), SIZE)
+    nodes, tets = box_cells((12, 2, 2), SIZE)
     volumes = np.linalg.det(nodes[tets[:, 1:]] - nodes[tets[:, :1]])
     tets = np.where(volumes[:, None] < 0.0, tets[:, [0, 2, 1, 3]], tets)
     boundary = boundary_of(tets)

@@ -25,7 +25,7 @@ def loaded(name):
 @pytest.fixture(scope="module")
 def scenes():
     module = loaded("mismatch_scenes")
-    module.TRUTH_EDGE_MM = 9.0
+    module.TRUTH_EDGE_MM = 11.0
     return module
 
 

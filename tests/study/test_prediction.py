@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +35,9 @@ def case_of(scene, **changes):
         "balls",
         images=Images(Path("before.nii.gz"), (Path("after.nii.gz"),)),
         tissues=tissues,
-        mesh=MeshSettings(8.0),
+        mesh=MeshSettings(10.0),
         mechanics=Mechanics("linear", "P1"),
-        driver=DriverMotion(modes=12),
+        driver=DriverMotion(modes=8),
         **changes,
     )
 
@@ -51,7 +52,7 @@ def states():
 @pytest.fixture(scope="module")
 def prediction_of(states):
     body = make_body(states, case_of(coarse_balls()), progress=silent)
-    return lambda **changes: predicted_intervals([body], case_of(coarse_balls(), **changes), progress=silent)
+    return cache(lambda **changes: predicted_intervals([body], case_of(coarse_balls(), **changes), progress=silent))
 
 
 def widths(prediction):
