@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
     from palpate.cohort.engines.packing import Engine
     from palpate.cohort.records import Record
-    from palpate.cohort.task import Row
     from palpate.progress import Progress
     from palpate.study.outputs import OutputFolder
 
@@ -35,10 +34,21 @@ def cohort(arguments: argparse.Namespace, _: None, outputs: OutputFolder | None,
         return Outcome({"schema": "palpate.task/1", "outcomes": outcomes}, f"{len(outcomes)} rows computed")
     require_tables()
     from palpate.cohort.run import Options, run_cohort
+    from palpate.cohort.table import read_derivatives, read_table
     from palpate.cohort.task import Limits
 
     assert outputs is not None
-    rows = _rows(arguments)
+    table, template = arguments.table, arguments.template
+    if table is None:
+        raise ConfigurationError("name the cohort's table: palpate cohort cohort.csv --output DIR")
+    if template is not None and not template.is_file():
+        raise ConfigurationError(f"there is no template {template}; give the path of a case.toml")
+    if table.is_dir():
+        rows = read_derivatives(table, template, reference=arguments.reference)
+    elif arguments.reference is not None:
+        raise ConfigurationError("--reference goes with BIDS derivatives; in a table, 'before' names the rest state")
+    else:
+        rows = read_table(table, template)
     engine = _engine(arguments, outputs.path)
     options = Options(
         overrides=tuple(arguments.set),
@@ -79,21 +89,6 @@ def statistics(_: argparse.Namespace, case: None, outputs: OutputFolder, progres
     close_cohort(plan, outputs.path)
     document = read_json(outputs.path / "statistics.json")
     return Outcome(document, f"{_associations(document)}\nwritten to {outputs.path}: {', '.join(TARGETS[:-1])}")
-
-
-def _rows(arguments: argparse.Namespace) -> Sequence[Row]:
-    from palpate.cohort.table import read_derivatives, read_table
-
-    table, template = arguments.table, arguments.template
-    if table is None:
-        raise ConfigurationError("name the cohort's table: palpate cohort cohort.csv --output DIR")
-    if template is not None and not template.is_file():
-        raise ConfigurationError(f"there is no template {template}; give the path of a case.toml")
-    if table.is_dir():
-        return read_derivatives(table, template, reference=arguments.reference)
-    if arguments.reference is not None:
-        raise ConfigurationError("--reference goes with BIDS derivatives; in a table, 'before' names the rest state")
-    return read_table(table, template)
 
 
 def _engine(arguments: argparse.Namespace, folder: Path) -> Engine:

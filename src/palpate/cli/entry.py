@@ -59,29 +59,24 @@ def _outcome(arguments: argparse.Namespace, came: Sequence[int], written: list[s
     """What the command has to say, errors among it; `came`: the signals so far. Its log is closed."""
     try:
         return _run(arguments, written)
-    except Exception as error:
-        return _failure("Interrupted", _interrupted(written), INTERRUPTED) if came else _failed(error, arguments)
-    except KeyboardInterrupt:
-        return _failure("Interrupted", _interrupted(written), INTERRUPTED)
+    except (Exception, KeyboardInterrupt) as error:
+        if came or isinstance(error, KeyboardInterrupt):
+            return _failure("Interrupted", _interrupted(written), INTERRUPTED)
+        if isinstance(error, PalpateError):
+            return _failure(type(error).__name__, str(error), error.exit_code)
+        if isinstance(error, MemoryError):
+            advice = "memory is short; make mesh.edge_length_mm larger or the images smaller"
+            return _failure("ResourceError", advice, ResourceError.exit_code)
+        hint = f" with {arguments.output / 'log.txt'}, which holds the details" if log_is_open() else ""
+        LOGGER.error("unexpected error", exc_info=error)  # a bug: the traceback belongs into the log, not on a terminal
+        sentence = f"unexpected {type(error).__name__}: {error}. This is a bug; please report it{hint}"
+        return _failure(type(error).__name__, sentence, UNEXPECTED)
     finally:
         close_log()
 
 
 def _interrupted(written: Sequence[str]) -> str:
     return REPLACED.format(", ".join(written)) if written else UNTOUCHED
-
-
-def _failed(error: Exception, arguments: argparse.Namespace) -> Outcome:
-    """The sentence and the exit code of an error."""
-    if isinstance(error, PalpateError):
-        return _failure(type(error).__name__, str(error), error.exit_code)
-    if isinstance(error, MemoryError):
-        advice = "memory is short; make mesh.edge_length_mm larger or the images smaller"
-        return _failure("ResourceError", advice, ResourceError.exit_code)
-    hint = f" with {arguments.output / 'log.txt'}, which holds the details" if log_is_open() else ""
-    LOGGER.error("unexpected error", exc_info=error)  # a bug: the traceback belongs into the log, not on the terminal
-    sentence = f"unexpected {type(error).__name__}: {error}. This is a bug; please report it{hint}"
-    return _failure(type(error).__name__, sentence, UNEXPECTED)
 
 
 def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:

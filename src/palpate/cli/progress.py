@@ -14,7 +14,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TextIO, cast
 
@@ -91,7 +91,11 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
                 words = f"[{now - began:6.1f} s] still, after {now - since:.0f} s: {printable(sentence)}"
                 tell(fitted(words, stream), stream)
 
-    stream = None if quiet else _duplicate(sys.stderr)  # before any library takes the place of standard error
+    # a stream to the same place, which stays open while a library's own words on standard error are sent nowhere
+    stream: TextIO | None = None if quiet else sys.stderr
+    if stream is not None:
+        with suppress(OSError, ValueError):  # closed, or no file
+            stream = os.fdopen(os.dup(stream.fileno()), "w", encoding=stream.encoding)
     try:
         with nullcontext() if quiet else _beside(remind):
             yield progress
@@ -114,14 +118,6 @@ def fitted(line: str, stream: TextIO | None) -> str:
     wrapper = textwrap.TextWrapper(width - 1, subsequent_indent=" " * INDENT)
     wrapper.break_long_words = wrapper.break_on_hyphens = False
     return wrapper.fill(line)
-
-
-def _duplicate(stream: TextIO | None) -> TextIO | None:
-    """A stream to the same place that stays open while a library's own words on standard error are sent nowhere."""
-    try:
-        return None if stream is None else os.fdopen(os.dup(stream.fileno()), "w", encoding=stream.encoding)
-    except (OSError, ValueError):  # closed, or no file
-        return stream
 
 
 @contextmanager

@@ -39,7 +39,24 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
         if record.page:
             says = f"report of {record.row.id}, patient {record.row.patient}"
             pages.setdefault(record.row.patient, (record.page, says))
-    charts = {tissue: _charts(document, tissue, place, pages) for place, tissue in enumerate(document["organs"])}
+    patients, charts = document["patients"], dict[str, list[_Chart]]()
+    for place, (tissue, organ) in enumerate(document["organs"].items()):
+        drawings = {
+            "Scans by stage, patients as points": partial(boxes_svg, patients, tissue, organ["unit"]),
+            "Patients against the stage": partial(scatter_svg, patients, tissue, organ["unit"], organ["regression"]),
+            "Patients": partial(forest_svg, patients, tissue, organ["unit"]),
+        }
+        charts[tissue] = []
+        for i, (title, draw) in enumerate(drawings.items()):
+            try:
+                svg = draw(name=f"c{place}-{i}", pages=pages)
+                chart = _Chart(title, Markup(svg))  # noqa: S704 - drawn by us, names in it as paths
+            except ValueError as error:
+                chart = _Chart(title, None, str(error))
+            except Exception as error:
+                LOGGER.exception("a chart could not be drawn")
+                chart = _Chart(title, None, f"it could not be drawn ({error})")
+            charts[tissue].append(chart)
     shown = [record for record in records if record.state == "failed"] + [r for r in records if r.state != "failed"]
     page: str = template_of("cohort.html", "palpate.cohort").render(
         records=shown[:MOST_ROWS],
@@ -51,25 +68,3 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
         policy=POLICY,
     )
     return page
-
-
-def _charts(
-    document: Mapping[str, Any], tissue: str, place: int, pages: Mapping[str, tuple[str, str]]
-) -> tuple[_Chart, ...]:
-    organ, patients = document["organs"][tissue], document["patients"]
-    drawings = {
-        "Scans by stage, patients as points": partial(boxes_svg, patients, tissue, organ["unit"]),
-        "Patients against the stage": partial(scatter_svg, patients, tissue, organ["unit"], organ["regression"]),
-        "Patients": partial(forest_svg, patients, tissue, organ["unit"]),
-    }
-    charts = []
-    for i, (title, draw) in enumerate(drawings.items()):
-        try:
-            svg = draw(name=f"c{place}-{i}", pages=pages)
-            charts.append(_Chart(title, Markup(svg)))  # noqa: S704 - drawn by us, names in it as paths
-        except ValueError as error:
-            charts.append(_Chart(title, None, str(error)))
-        except Exception as error:
-            LOGGER.exception("a chart could not be drawn")
-            charts.append(_Chart(title, None, f"it could not be drawn ({error})"))
-    return tuple(charts)

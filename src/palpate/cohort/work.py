@@ -16,7 +16,6 @@ from palpate.images.named_labels import printable
 from palpate.memory import peak_memory_gb
 from palpate.steps.saving import save_estimate, save_failure
 from palpate.study import run
-from palpate.study.case import Case
 from palpate.study.cost import ExpectedCost
 from palpate.study.earlier import refuse_other_case
 from palpate.study.edge_length import edge_length_of
@@ -59,7 +58,15 @@ def _attempt(task: Task, tell: Tell) -> Outcome:
     folder = Path(task.folder)
     case = case_of(task.row, task.overrides)
     key = row_key(task.row, task.overrides)
-    outputs = OutputFolder(folder)
+    outputs, expected = OutputFolder(folder), list[float]()
+
+    def condition(cost: ExpectedCost) -> None:
+        """Say what the estimate will take, and leave it when that is not there."""
+        if task.room_gb is not None and cost.memory_gb > task.room_gb:
+            raise RoomError(cost.memory_gb)
+        expected.append(cost.memory_gb)
+        tell(cost.memory_gb, cost.seconds)
+
     with held_soon(folder):
         earlier = read_mark(folder)
         if earlier is not None and earlier.key == key and earlier.state == "done":
@@ -73,31 +80,19 @@ def _attempt(task: Task, tell: Tell) -> Outcome:
             edge = round(edge * task.coarser, 3)
             overrides = (*case.overrides, f"mesh.edge_length_mm={edge}")
             case = replace(case, mesh=replace(case.mesh, edge_length_mm=edge), overrides=overrides)
-        return _estimated(task, case, key, outputs, tell)
-
-
-def _estimated(task: Task, case: Case, key: str, outputs: OutputFolder, tell: Tell) -> Outcome:
-    began, expected = time.monotonic(), list[float]()
-
-    def condition(cost: ExpectedCost) -> None:
-        """Say what the estimate will take, and leave it when that is not there."""
-        if task.room_gb is not None and cost.memory_gb > task.room_gb:
-            raise RoomError(cost.memory_gb)
-        expected.append(cost.memory_gb)
-        tell(cost.memory_gb, cost.seconds)
-
-    try:
-        result = run.estimate(case, progress=LOGGER.info, condition=condition)
-    except EstimationError as error:
-        save_failure(case, error, outputs)
-        raise
-    document = save_estimate(result, outputs, progress=LOGGER.info)
-    if row_key(task.row, task.overrides) != key:
-        raise InputDataError("an input was changed while it was used; run the cohort again, with --resume")
-    if document["status"] != "converged":
-        return Outcome.failed(task, "solver", f"{document['status']}: {printable(document['reason'])}")
-    outcome = Outcome(task.row.id, "done", key, message="; ".join(task.remarks), attempts=task.attempt)
-    took = outcome.took(
-        time.monotonic() - began, expected_gb=expected[0] if expected else None, peak_gb=peak_memory_gb()
-    )
-    return write_mark(outputs.path, took)
+        began = time.monotonic()
+        try:
+            result = run.estimate(case, progress=LOGGER.info, condition=condition)
+        except EstimationError as error:
+            save_failure(case, error, outputs)
+            raise
+        document = save_estimate(result, outputs, progress=LOGGER.info)
+        if row_key(task.row, task.overrides) != key:
+            raise InputDataError("an input was changed while it was used; run the cohort again, with --resume")
+        if document["status"] != "converged":
+            return Outcome.failed(task, "solver", f"{document['status']}: {printable(document['reason'])}")
+        outcome = Outcome(task.row.id, "done", key, message="; ".join(task.remarks), attempts=task.attempt)
+        took = outcome.took(
+            time.monotonic() - began, expected_gb=expected[0] if expected else None, peak_gb=peak_memory_gb()
+        )
+        return write_mark(folder, took)

@@ -7,7 +7,6 @@ not: C10, C01 and D1 = 2 / K give the same moduli at small strain, mu and K, and
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +27,7 @@ from palpate.export.groups import (
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
-from palpate.mechanics.loads import FollowingPressure, Load
+from palpate.mechanics.loads import FollowingPressure
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case_loads import loads_on
 from palpate.study.outputs import write_text
@@ -93,7 +92,10 @@ def _material(model: FittedModel, body: FittedBody, part: MaterialPart) -> str:
 
 
 def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[str]:
-    """A step a later image: walls, bones and the cut of the image where the fit has them, and the known loads."""
+    """A step a later image: walls, bones and the cut of the image where the fit has them, and the known loads.
+
+    A pressure that follows its surface acts on the elements' faces; other loads are their forces on the nodes, mN.
+    """
     held = prescribed(body, space, outer=model.outer_boundary)
     parts = []
     if not held.along_world:
@@ -111,21 +113,15 @@ def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[s
             parts += [rows("%d, %d, %d", still, np.full(len(still), axis + 1), np.full(len(still), axis + 1))]
         if any(body.loads[: number - 1]):  # what acted in the step before does not stay
             parts += ["*CLOAD, OP=NEW\n*DLOAD, OP=NEW\n"]
-        parts += _loads(loads_on(space, body.loads[number - 1], densities=model.densities), body, space, number)
+        new = ", OP=NEW" if number > 1 else ""
+        for load in loads_on(space, body.loads[number - 1], densities=model.densities):
+            if isinstance(load, FollowingPressure):
+                cells, faces = element_faces(body.mesh, load.faces[:, :3])
+                pressures = np.full(len(cells), load.kilopascal)
+                parts += [f"*DLOAD{new}\n", rows("%d, P%d, %.12g", cells + 1, FACE[faces], pressures)]
+            else:
+                forces = load.forces(np.zeros_like(space.points)).reshape(-1, 3)
+                points, axes = np.nonzero(forces)
+                parts += [f"*CLOAD{new}\n", rows("%d, %d, %.12g", points + 1, axes + 1, forces[points, axes])]
         parts += ["*NODE PRINT, NSET=ALL_NODES\nU\n*NODE FILE\nU\n*END STEP\n"]
-    return parts
-
-
-def _loads(loads: Sequence[Load], body: FittedBody, space: LagrangeSpace, step: int) -> list[str]:
-    """A pressure that follows its surface on the elements' faces; other loads as their forces on the nodes, mN."""
-    parts, new = [], ", OP=NEW" if step > 1 else ""
-    for load in loads:
-        if isinstance(load, FollowingPressure):
-            cells, faces = element_faces(body.mesh, load.faces[:, :3])
-            pressures = np.full(len(cells), load.kilopascal)
-            parts += [f"*DLOAD{new}\n", rows("%d, P%d, %.12g", cells + 1, FACE[faces], pressures)]
-        else:
-            forces = load.forces(np.zeros_like(space.points)).reshape(-1, 3)
-            points, axes = np.nonzero(forces)
-            parts += [f"*CLOAD{new}\n", rows("%d, %d, %.12g", points + 1, axes + 1, forces[points, axes])]
     return parts

@@ -42,28 +42,24 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     for group in face_groups(body.mesh):
         area = float(np.linalg.norm(triangle_normals(body.mesh.nodes, group.triangles), axis=1).sum())
         areas.append((group.name, len(group.triangles), _number(area)))
-    _table(folder / "tissues.csv", TISSUES, _tissues(model, body))
-    _table(folder / "groups.csv", ("group", "faces", "area_before_mm2"), areas)
-    samples = moduli_samples(model)
-    rows = ((*place[:2], samples.tissues[place[2]], _number(value)) for place, value in np.ndenumerate(samples.moduli))
-    _table(folder / "samples.csv", ("chain", "draw", "tissue", "youngs_modulus"), rows)
-
-
-def _tissues(model: FittedModel, body: FittedBody) -> Iterable[Sequence[object]]:
-    estimates = {item.tissue: item for item in model.estimates}
+    tissues, estimates = list[Sequence[object]](), {item.tissue: item for item in model.estimates}
     before, after = body.mesh.volumes, volumes_after(body.space, body.displacements[-1])
     for number, label in enumerate(first_labels(body.tissues).tolist()):
         tissue = body.tissues[number]
         own, region = estimates.get(tissue.name), body.mesh.region == number
         low, high = (own.interval95 if own else None) or (None, None)
         least, most = (own.ratio_interval95 if own else None) or (None, None)
-        yield (
-            *(tissue.name, str(tissue.role), label, model.unit, _number(model.moduli[number])),
-            *(_number(low), _number(high), _number(own.ratio if own else None), _number(least), _number(most)),
-            *(own.relative_to if own else "", own.verdict if own else ""),
-            *(_number(tissue.poisson_ratio) if tissue.meshed else "",),
-            *(_number(volumes[region].sum()) if tissue.meshed else "" for volumes in (before, after)),
-        )
+        row = [tissue.name, str(tissue.role), label, model.unit, _number(model.moduli[number])]
+        row += [_number(low), _number(high), _number(own.ratio if own else None), _number(least), _number(most)]
+        row += [own.relative_to, own.verdict] if own else ["", ""]
+        row.append(_number(tissue.poisson_ratio) if tissue.meshed else "")
+        row += [_number(volumes[region].sum()) if tissue.meshed else "" for volumes in (before, after)]
+        tissues.append(row)
+    _table(folder / "tissues.csv", TISSUES, tissues)
+    _table(folder / "groups.csv", ("group", "faces", "area_before_mm2"), areas)
+    samples = moduli_samples(model)
+    rows = ((*place[:2], samples.tissues[place[2]], _number(value)) for place, value in np.ndenumerate(samples.moduli))
+    _table(folder / "samples.csv", ("chain", "draw", "tissue", "youngs_modulus"), rows)
 
 
 def _number(value: float | None) -> str:

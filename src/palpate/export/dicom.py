@@ -80,8 +80,14 @@ def write(model: FittedModel, body: FittedBody, folder: Path, source: Path | Non
         "segmentation.dcm": _segmentation(highdicom, slices, volume, body, common),
     }
     for name, dataset in made.items():
-        if source is None:
-            _forget_source(dataset)
+        if source is None:  # every reference to the placeholder goes, which nobody could find
+            for reference in ("ReferencedSeriesSequence", "SourceImageSequence", "ReferencedImageEvidenceSequence"):
+                if reference in dataset:
+                    delattr(dataset, reference)
+            frames = dataset.get("PerFrameFunctionalGroupsSequence", [])
+            for group in (*dataset.get("SharedFunctionalGroupsSequence", []), *frames):
+                if "DerivationImageSequence" in group:
+                    del group.DerivationImageSequence
         content = io.BytesIO()
         dataset.save_as(content, enforce_file_format=True)
         write_bytes(folder / name, content.getvalue())
@@ -178,17 +184,6 @@ def _placeholder() -> Dataset:
     found.ImagePositionPatient, found.ImageOrientationPatient = [0, 0, 0], [1, 0, 0, 0, 1, 0]
     found.PixelSpacing, found.SliceThickness = [1, 1], 1
     return found
-
-
-def _forget_source(dataset: Dataset) -> None:
-    """Take out every reference to the placeholder, which nobody could find."""
-    for name in ("ReferencedSeriesSequence", "SourceImageSequence", "ReferencedImageEvidenceSequence"):
-        if name in dataset:
-            delattr(dataset, name)
-    frames = dataset.get("PerFrameFunctionalGroupsSequence", [])
-    for group in (*dataset.get("SharedFunctionalGroupsSequence", []), *frames):
-        if "DerivationImageSequence" in group:
-            del group.DerivationImageSequence
 
 
 def _series(folder: Path, body: FittedBody) -> list[Dataset]:

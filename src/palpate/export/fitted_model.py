@@ -17,7 +17,6 @@ from palpate.mechanics.laws.registry import law_from
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.study.case_data import CaseLoad
-from palpate.study.discrepancy import FittedMaterial
 from palpate.study.estimated import ModulusEstimate
 from palpate.study.result import CaseResult, PairResult
 from palpate.study.samples import ModulusSamples
@@ -157,7 +156,24 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
     numbers = np.cumsum([1, *(len(motions) for _, motions in pairs)]).tolist()
     loads = [tuple(case.loads_in(n) for n in range(*ends)) for ends in pairwise(numbers)]
     materials = [estimation.materials[n - 1] if estimation.materials else None for n in numbers[:-1]]
-    bodies = [_body(*pair, acting, of) for pair, acting, of in zip(pairs, loads, materials, strict=True)]
+    bodies = list[FittedBody]()
+    for (pair, displacements), acting, material in zip(pairs, loads, materials, strict=True):
+        mesh, shifts = pair.space.mesh, material.poisson_shifts if material else {}
+        ratios = [min(tissue.poisson_ratio + shifts.get(tissue.name, 0.0), HIGHEST_RATIO) for tissue in mesh.tissues]
+        # the labels' own names are the image's
+        own = (replace(t, called=(), poisson_ratio=ratio) for t, ratio in zip(mesh.tissues, ratios, strict=True))
+        alignments = tuple(found.motion.matrix for found in pair.alignments) or tuple(np.eye(4) for _ in displacements)
+        fitted = FittedBody(
+            replace(mesh, tissues=tuple(own)),
+            pair.space.order,
+            displacements or (np.zeros_like(pair.space.points),),
+            alignments or (np.eye(4),),
+            pair.before.index,
+            pair.before.grid,
+            acting or ((),),
+            None if material is None else material.log_ratio,
+        )
+        bodies.append(fitted)
     density = {tissue.name: tissue.density_kg_m3 for tissue in case.tissues}
     law = case.mechanics.material_law
     return FittedModel(
@@ -175,28 +191,4 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
         seal,
         estimation.samples,
         case.strained_reference,
-    )
-
-
-def _body(
-    pair: CaseResult | PairResult,
-    displacements: tuple[NDArray[np.float64], ...],
-    loads: tuple[tuple[CaseLoad, ...], ...],
-    material: FittedMaterial | None,
-) -> FittedBody:
-    mesh, shifts = pair.space.mesh, material.poisson_shifts if material else {}
-    ratios = [min(tissue.poisson_ratio + shifts.get(tissue.name, 0.0), HIGHEST_RATIO) for tissue in mesh.tissues]
-    # the labels' own names are the image's
-    nameless = tuple(replace(t, called=(), poisson_ratio=ratio) for t, ratio in zip(mesh.tissues, ratios, strict=True))
-    alignments = tuple(found.motion.matrix for found in pair.alignments) or tuple(np.eye(4) for _ in displacements)
-    motions = displacements or (np.zeros_like(pair.space.points),)
-    return FittedBody(
-        replace(mesh, tissues=nameless),
-        pair.space.order,
-        motions,
-        alignments or (np.eye(4),),
-        pair.before.index,
-        pair.before.grid,
-        loads or ((),),
-        None if material is None else material.log_ratio,
     )

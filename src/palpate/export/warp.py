@@ -33,7 +33,14 @@ SAME_MM = 1e-3
 def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write warp.nii.gz, inverse_warp.nii.gz (numbered where there are several later images) and warp.json."""
     del model
-    space, grid = body.space, _field_grid(body.grid)
+    space, own = body.space, body.grid
+    # the same box with voxels of a millimetre at least
+    counts = np.maximum(np.minimum(own.shape, np.ceil(np.array(own.shape) * own.spacing / FINEST_MM)), 2).astype(int)
+    steps = np.array(own.shape) / counts
+    affine = np.array(own.affine)
+    affine[:3, :3] = affine[:3, :3] * steps
+    affine[:3, 3] = own.world(0.5 * (steps - 1.0)[None])[0]
+    grid = VoxelGrid((int(counts[0]), int(counts[1]), int(counts[2])), affine)
     meshed = [number for number, tissue in enumerate(body.tissues) if tissue.meshed]
     borders = np.concatenate([tissue_surface(body.mesh, number).triangles for number in meshed])
     surface = np.unique(space.facets(borders))
@@ -83,16 +90,6 @@ def field_on_grid(space: LagrangeSpace, displacement: NDArray[np.float64], grid:
         owners, _ = element_faces(mesh, mesh.boundary)
         field[ring] = _at(space, displacement, owners[np.asarray(faces)], beside)
     return _filled(field, inside | ring)
-
-
-def _field_grid(grid: VoxelGrid) -> VoxelGrid:
-    """The same box with voxels of a millimetre at least."""
-    counts = np.maximum(np.minimum(grid.shape, np.ceil(np.array(grid.shape) * grid.spacing / FINEST_MM)), 2).astype(int)
-    steps = np.array(grid.shape) / counts
-    affine = np.array(grid.affine)
-    affine[:3, :3] = affine[:3, :3] * steps
-    affine[:3, 3] = grid.world(0.5 * (steps - 1.0)[None])[0]
-    return VoxelGrid((int(counts[0]), int(counts[1]), int(counts[2])), affine)
 
 
 def _rms(vectors: NDArray[np.float64]) -> float:

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import matplotlib as mpl
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from palpate.report.rows import NONE, estimate_rows, interval_text, main_numbers, moduli_in, ratio_rows
@@ -60,27 +59,27 @@ def moduli_figure(document: Mapping[str, Any], colours: Mapping[str, str]) -> Fi
         known = [number for number in numbers if number]
         axes.set_xlim(min(known, default=1.0) / ROOM, max(known, default=1.0) * ROOM)
         mark_decades(axes.xaxis)
+        ends = axes.get_xlim()
         for row, item in enumerate(items):
-            _draw_item(axes, row, item, colours.get(item["tissue"], GREY))
+            value, interval = main_numbers(item)
+            colour = colours.get(item["tissue"], GREY)
+            if item["truth"] is not None:
+                axes.plot([item["truth"]] * 2, [row - 0.3, row + 0.3], color="black", linestyle="--", label="truth")
+            if value is None:
+                where = axes.get_yaxis_transform()
+                axes.text(0.5, row, "no value", transform=where, ha="center", va="center", color=GREY)
+                continue
+            low, high = interval or (value, value)  # a dot alone where no interval is stated
+            line = [low or ends[0], high or ends[1]]
+            axes.plot(line, [row, row], color=colour, linewidth=5, alpha=0.55, gid="interval")
+            for end, marker, place in ((low, "<", ends[0]), (high, ">", ends[1])):
+                if end is None:
+                    axes.plot(place, row, marker=marker, color=colour, markersize=9, clip_on=False, gid="open")
+            words = f"{value:.3g} ({interval_text(interval)})"
+            axes.plot(value, row, "o", color=colour, markeredgecolor="black", label=words)
         axes.set_yticks(range(len(items)), [f"{item['tissue']}\n{item['verdict']}" for item in items])
         axes.set_ylim(len(items) - 0.5, -0.5)
         in_kpa = all(item["unit"] == "kPa" for item in items)
         axes.set_xlabel("Young's modulus (kPa), 95 % interval" if in_kpa else "ratio of moduli, 95 % interval")
         axes.grid(visible=True, axis="x", alpha=0.3)
     return figure
-
-
-def _draw_item(axes: Axes, row: int, item: Mapping[str, Any], colour: str) -> None:
-    value, interval = main_numbers(item)
-    if item["truth"] is not None:
-        axes.plot([item["truth"]] * 2, [row - 0.3, row + 0.3], color="black", linestyle="--", label="truth")
-    if value is None:
-        axes.text(0.5, row, "no value", transform=axes.get_yaxis_transform(), ha="center", va="center", color=GREY)
-        return
-    low, high = interval or (value, value)  # a dot alone where no interval is stated
-    ends = axes.get_xlim()
-    axes.plot([low or ends[0], high or ends[1]], [row, row], color=colour, linewidth=5, alpha=0.55, gid="interval")
-    for end, marker, place in ((low, "<", ends[0]), (high, ">", ends[1])):
-        if end is None:
-            axes.plot(place, row, marker=marker, color=colour, markersize=9, clip_on=False, gid="open")
-    axes.plot(value, row, "o", color=colour, markeredgecolor="black", label=f"{value:.3g} ({interval_text(interval)})")

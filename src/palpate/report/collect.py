@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import PalpateError
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue import FieldPrior, Role, Tissue, tissue_colours
+from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.mechanics.element import largest_strains
 from palpate.mesh.tet_mesh import tet_dihedrals
 from palpate.parallel import mapped
@@ -37,7 +37,6 @@ from palpate.report.stiffness_maps import tissue_maps
 from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, contour_width, image_surface, model_surface
 from palpate.report.volume import MOVING, Grey, background, earlier_grey, later_grey, slice_box, whole_box, whole_images
 from palpate.study.case import Case
-from palpate.study.case_data import CaseData, CaseLoad
 from palpate.study.result import CaseResult, MeshSummary, failure_document, stated_unit
 
 LOGGER = logging.getLogger(__name__)
@@ -79,8 +78,8 @@ class _Drawing:
     number: int
     most_triangles: int
     attempt: _Attempt
-    grey: Grey | None = None
-    unread: bool = False
+    grey: Grey | None
+    unread: bool
 
 
 def collect(result: CaseResult) -> ReportData:
@@ -91,9 +90,16 @@ def collect(result: CaseResult) -> ReportData:
     drawn = drawn_images([len(pair.after) for pair in pairs], MOST_LATER)
     pairs = pairs[: max(len({number for number, _ in drawn}), 1)]
     surfaces = max((len(pairs) + len(drawn)) * len(_indices(result, SHOWN)), 1)
-    drawings = [
-        _with_grey(_Drawing(pair, number, ALL_TRIANGLES // surfaces, attempt)) for number, pair in enumerate(pairs)
-    ]
+    drawings = list[_Drawing]()
+    for number, pair in enumerate(pairs):
+        grey, unread = None, False
+        try:
+            grey = earlier_grey(pair.result)
+        except PalpateError as error:  # the page tells of it
+            LOGGER.warning("the grey image is left out of the report: %s", error)
+            attempt.missing[f"background of {pair.before}"] = f"The labels stand in place of the grey image: {error}"
+            unread = True
+        drawings.append(_Drawing(pair, number, ALL_TRIANGLES // surfaces, attempt, grey, unread))
     references = tuple(_reference(drawing) for drawing in drawings)
     later = tuple(_later(drawings[number], after, references[number]) for number, after in drawn)
     by_place = dict(zip(drawn, later, strict=True))
@@ -139,15 +145,6 @@ def _now() -> str:
     return datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
-def _edge_length(case: Case, mesh: MeshSummary | None) -> str:
-    """That of the case, or of its mesh with the reason."""
-    if case.mesh.edge_length_mm is not None:
-        return f"{case.mesh.edge_length_mm:g} mm"
-    if mesh is None or mesh.edge_length_mm is None:
-        return "chosen by the organs"
-    return f"{mesh.edge_length_mm:g} mm, chosen: {mesh.edge_length_reason}"
-
-
 def _settings(case: Case, mesh: MeshSummary | None = None) -> tuple[tuple[str, str], ...]:
     """What the case asked for, in words, and what it was given where it left the choice."""
     mechanics, domain, driver, options = case.mechanics, case.domain, case.driver, case.estimate
@@ -155,17 +152,17 @@ def _settings(case: Case, mesh: MeshSummary | None = None) -> tuple[tuple[str, s
     by_load = bool(case.loads) and not any(tissue.role is Role.KNOWN for tissue in case.tissues)
     in_kpa = " kPa" if by_load else " (ratios)"
     starts, bounds = options.starts_kpa or options.start_ratios, options.bounds_kpa or options.bounds_ratio
-    loads = [("known load", _load(load)) for load in case.loads]
-    loads += [("measurement", _measured(data)) for data in case.data]
-    loads += [(f"{MAP_OF}{t.name}", _field(of)) for t in case.tissues if (of := t.with_labels(()).field)]
-    loads += [("body", MESH)] if case.body is not None else []
-    noise = case.noise
+    edge, noise = "chosen by the organs", case.noise
+    if case.mesh.edge_length_mm is not None:
+        edge = f"{case.mesh.edge_length_mm:g} mm"
+    elif mesh is not None and mesh.edge_length_mm is not None:
+        edge = f"{mesh.edge_length_mm:g} mm, chosen: {mesh.edge_length_reason}"
     return (
-        *loads,
+        *_brought(case),
         ("material law", mechanics.law),
         *((p.name, f"{mechanics.law_parameters.get(p.name, p.default):g}") for p in mechanics.material_law.parameters),
         ("element", mechanics.element),
-        ("edge length at the organs", _edge_length(case, mesh)),
+        ("edge length at the organs", edge),
         ("outer boundary", f"{domain.outer_boundary}; domain: {domain.extent}{margin}"),
         ("alignment", case.align),
         (
@@ -184,31 +181,32 @@ def _settings(case: Case, mesh: MeshSummary | None = None) -> tuple[tuple[str, s
     )
 
 
-def _field(prior: FieldPrior) -> str:
-    """What is believed of ln E inside a tissue that is mapped."""
-    law = VARIATION if prior.total_variation else "Gaussian, Matern's kernel"
-    return f"{law}, sd {prior.sd:g} of ln E, length {prior.length_mm:g} mm"
-
-
-def _measured(data: CaseData) -> str:
-    """A measurement in words, by what the case states of it; no name of a file."""
-    if data.force_n is not None:
-        return f"{data.kind} of {data.force_n:g} N on {data.surface}, sd {data.sd_n or 0.0:g} N, state {data.state}"
-    error = "with a covariance" if data.sd_mm is None else f"sd {data.sd_mm:g} mm"
-    alike = f", alike over {data.correlation_mm:g} mm" if data.correlation_mm else ""
-    return f"{data.kind}, {error}{alike}, state {data.state}"
-
-
-def _load(load: CaseLoad) -> str:
-    """A known load in words."""
-    when = "" if load.state is None else f", in later state {load.state}" if load.state else ", in the reference state"
-    where = (f" on {load.surface}" if load.surface else "") + when
-    if load.acceleration_m_s2 is not None:
-        return f"gravity {_vector(load.acceleration_m_s2)} m/s^2{where}"
-    if load.traction_kpa is not None:
-        return f"traction {_vector(load.traction_kpa)} kPa{where}"
-    kind = "following pressure" if load.following else "dead pressure"
-    return f"{kind} {load.pressure_kpa or 0.0:g} kPa{where}"
+def _brought(case: Case) -> list[tuple[str, str]]:
+    """Known loads, measurements, priors of what is mapped and a given mesh in words, without a file's name."""
+    found = list[tuple[str, str]]()
+    for load in case.loads:
+        kind = "following" if load.following else "dead"
+        words = f"{kind} pressure {load.pressure_kpa or 0.0:g} kPa"
+        if load.acceleration_m_s2 is not None:
+            words = f"gravity {_vector(load.acceleration_m_s2)} m/s^2"
+        elif load.traction_kpa is not None:
+            words = f"traction {_vector(load.traction_kpa)} kPa"
+        when = f", in later state {load.state}" if load.state else ", in the reference state"
+        where = f" on {load.surface}" if load.surface else ""
+        found.append(("known load", f"{words}{where}{'' if load.state is None else when}"))
+    for data in case.data:
+        error = "with a covariance" if data.sd_mm is None else f"sd {data.sd_mm:g} mm"
+        alike = f", alike over {data.correlation_mm:g} mm" if data.correlation_mm else ""
+        words = f"{data.kind}, {error}{alike}"
+        if data.force_n is not None:
+            words = f"{data.kind} of {data.force_n:g} N on {data.surface}, sd {data.sd_n or 0.0:g} N"
+        found.append(("measurement", f"{words}, state {data.state}"))
+    for tissue in case.tissues:
+        if prior := tissue.with_labels(()).field:  # of ln E inside it
+            law = VARIATION if prior.total_variation else "Gaussian, Matern's kernel"
+            words = f"{law}, sd {prior.sd:g} of ln E, length {prior.length_mm:g} mm"
+            found.append((f"{MAP_OF}{tissue.name}", words))
+    return [*found, ("body", MESH)] if case.body is not None else found
 
 
 def _vector(parts: tuple[float, float, float]) -> str:
@@ -232,17 +230,6 @@ def report_tissues(tissues: tuple[Tissue, ...], moduli: NDArray[np.float64]) -> 
 
 def _indices(result: CaseResult, roles: tuple[Role, ...]) -> tuple[int, ...]:
     return tuple(i for i, tissue in enumerate(result.tissues) if tissue.role in roles)
-
-
-def _with_grey(drawing: _Drawing) -> _Drawing:
-    """The drawing with the grey image of its reference state; one that cannot be read is told of on the page."""
-    try:
-        return replace(drawing, grey=earlier_grey(drawing.pair.result))
-    except PalpateError as error:
-        LOGGER.warning("the grey image is left out of the report: %s", error)
-        words = f"The labels stand in place of the grey image: {error}"
-        drawing.attempt.missing[f"background of {drawing.pair.before}"] = words
-        return replace(drawing, unread=True)
 
 
 def _reference(drawing: _Drawing) -> Reference:

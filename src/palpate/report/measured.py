@@ -17,7 +17,6 @@ from palpate.report.report_data import (
     MeasuredState,
     Reference,
     SliceBox,
-    TriangleSurface,
 )
 from palpate.report.surfaces import carried_outline
 from palpate.study.estimated import PointFit
@@ -60,7 +59,17 @@ def measured_states(
                 outlines = tuple(carried_outline(own, surface, after) for surface in meshed)
             name = pair_names(result.case)[pair][1][after]
             points = tuple(measured_points(fit) for fit in fits)
-            found.append(_state(name, pair, references[pair].slices, points, outlines))
+            # slices through the middle of the points, and arrows that can be seen
+            rest = np.concatenate([of.rest for of in points]).astype(np.float64)
+            low, high = rest.min(axis=0) - AROUND_MM, rest.max(axis=0) + AROUND_MM
+            slices = references[pair].slices
+            if slices is not None:
+                low, high = np.minimum(low, slices.low), np.maximum(high, slices.high)
+            size, box = float((high - low).max()), SliceBox(low, high, np.median(rest, axis=0))
+            ways = ([of.observed for of in points], [of.fitted - of.observed for of in points])
+            lengths = [np.linalg.norm(np.concatenate(way), axis=1).astype(np.float64) for way in ways]
+            factors = [nice_factor(of, size) for of in lengths]
+            found.append(MeasuredState(name, pair, box, points, outlines, *factors))
     return tuple(found)
 
 
@@ -121,22 +130,3 @@ def _one_a_cell(points: NDArray[np.float64], edge: float) -> NDArray[np.int64]:
     first = np.ones(len(points), dtype=bool)
     first[1:] = (np.diff(cells[order], axis=0) != 0).any(axis=1)
     return np.sort(order[first])
-
-
-def _state(
-    name: str,
-    reference: int,
-    slices: SliceBox | None,
-    points: tuple[MeasuredPoints, ...],
-    outlines: tuple[TriangleSurface, ...],
-) -> MeasuredState:
-    """The state with slices through the middle of its points, and with arrows that can be seen."""
-    rest = np.concatenate([of.rest for of in points]).astype(np.float64)
-    low, high = rest.min(axis=0) - AROUND_MM, rest.max(axis=0) + AROUND_MM
-    if slices is not None:
-        low, high = np.minimum(low, slices.low), np.maximum(high, slices.high)
-    moved = np.concatenate([np.linalg.norm(of.observed, axis=1) for of in points]).astype(np.float64)
-    left = np.concatenate([np.linalg.norm(of.fitted - of.observed, axis=1) for of in points]).astype(np.float64)
-    size = float((high - low).max())
-    box = SliceBox(low, high, np.median(rest, axis=0))
-    return MeasuredState(name, reference, box, points, outlines, nice_factor(moved, size), nice_factor(left, size))

@@ -53,6 +53,12 @@ def methods_text(data: ReportData) -> Methods:
     leaning = listed([item["tissue"] for item in moduli_in(data.document) if item.get("interval_kind") == "profile"])
     if leaning:
         leaning = f"; of {leaning}, whose profile likelihood leans to one side, its ends are those of the profile"
+    # which unknowns the intervals allow for, and the errors of what is given, which they do not cover
+    shares = [share for item in moduli_in(data.document) for share in (item.get("variance_shares") or {}).items()]
+    counted = {cause for cause, share in shares if share > 0.0}
+    allowed = listed([CAUSES[cause] for cause in UNKNOWNS if cause in counted])
+    given = listed(["the material law", *(words for cause, words in GIVEN.items() if cause not in counted)])
+    covered = (f" They allow for {allowed}." if allowed else "") + f" They do not cover the errors of {given}."
     paragraphs = (
         _aim(data, cite),
         _model(data, cite),
@@ -60,7 +66,7 @@ def methods_text(data: ReportData) -> Methods:
         (
             "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated"
             f" residuals {cite('white')}, with the scatter over the voxel grid's position and a term for the mesh"
-            f" added{leaning}.{_covered(data)} The seed of random numbers was {data.document['seed']}."
+            f" added{leaning}.{covered} The seed of random numbers was {data.document['seed']}."
         ),
     )
     own = SOURCES["palpate"]
@@ -71,15 +77,6 @@ def methods_text(data: ReportData) -> Methods:
         tuple(reference_line(sources[key]) for key in cite.cited),
         "\n\n".join(bibtex(key, sources[key]) for key in cite.cited),
     )
-
-
-def _covered(data: ReportData) -> str:
-    """Which unknowns the intervals allow for, and the errors of what is given, which they do not cover."""
-    shares = [share for item in moduli_in(data.document) for share in (item.get("variance_shares") or {}).items()]
-    counted = {cause for cause, share in shares if share > 0.0}
-    allowed = listed([CAUSES[cause] for cause in UNKNOWNS if cause in counted])
-    given = listed(["the material law", *(words for cause, words in GIVEN.items() if cause not in counted)])
-    return (f" They allow for {allowed}." if allowed else "") + f" They do not cover the errors of {given}."
 
 
 def _aim(data: ReportData, cite: _Citations) -> str:
@@ -118,6 +115,8 @@ def _model(data: ReportData, cite: _Citations) -> str:
     ratios = sorted({f"{t.poisson_ratio:g}" for t in given})
     told = [f"Poisson's ratios of {listed(ratios)}"] if ratios else []
     told += [f"Poisson's ratios of {listed(sought)} as unknowns beside the moduli"] if sought else []
+    priors = {key.removeprefix(MAP_OF): prior for key, prior in data.settings if key.startswith(MAP_OF)}
+    fields = listed([f"{name} ({prior})" for name, prior in priors.items()])
     made = (
         "The label images were turned into signed distance maps by Gaussian smoothing and the probit of the smoothed"
         " share."
@@ -126,23 +125,18 @@ def _model(data: ReportData, cite: _Citations) -> str:
     )
     if settings.get("body") == MESH:
         made = f"The mesh{size} was given."
+    kernel = cite("kernel")
+    source = f" {cite('variation')}" if any(VARIATION in prior for prior in priors.values()) else ""
+    mapped = f" Inside {fields} ln E was a field{source}." if priors else ""
     return (
         f"{made} The tissues followed"
         f" {law.description if law else 'the law ' + document['law']} in"
         f" {ELEMENTS.get(document['element'], str(document['element']))}, with {listed(told)};"
         " each was one solid, so that the modulus of an organ with a wall around a fluid, as a bladder, is an effective"
         f" one, not its wall's. The outer boundary: {settings['outer boundary']}. The motion of the drivers' walls was"
-        f" a Gaussian process in its leading modes ({settings['driver motion']}) {cite('kernel')}, estimated together"
-        f" with the moduli.{_mapped(data, cite)}{acted}"
+        f" a Gaussian process in its leading modes ({settings['driver motion']}) {kernel}, estimated together"
+        f" with the moduli.{mapped}{acted}"
     )
-
-
-def _mapped(data: ReportData, cite: _Citations) -> str:
-    """Tissues whose modulus is a field, each with its prior."""
-    priors = {key.removeprefix(MAP_OF): prior for key, prior in data.settings if key.startswith(MAP_OF)}
-    source = f" {cite('variation')}" if any(VARIATION in prior for prior in priors.values()) else ""
-    told = listed([f"{name} ({prior})" for name, prior in priors.items()])
-    return f" Inside {told} ln E was a field{source}." if priors else ""
 
 
 def _law(data: ReportData) -> Law | None:

@@ -11,7 +11,6 @@ from functools import partial
 from importlib import resources
 from typing import Any, TypeVar
 
-import numpy as np
 from markupsafe import Markup, escape
 
 from palpate.findings import HARMLESS, WIDENING
@@ -33,7 +32,7 @@ from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png, points_png
 from palpate.report.report_data import LaterImage, MeasuredState, ReportData, SliceBox, TissueMap
 from palpate.report.rows import estimate_rows, headline, moduli_in, ratio_rows, scale_marks
-from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
+from palpate.report.scales import angle_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS
 from palpate.report.slices import alignment_svg, contour_names, first_planes, points_svg, slice_svg
 from palpate.report.stiffness_maps import map_png, map_svg
@@ -141,7 +140,6 @@ def render(data: ReportData, *, study: bool = False) -> str:
         ),
         angle_scale=angle_scale(),
         strain_scale=strain_scale() if data.mesh and len(data.mesh.strains) else None,
-        gradient=_gradient,
     )
     return str(page)
 
@@ -260,12 +258,6 @@ def _curves(data: ReportData) -> tuple[Picture, ...]:
         picture_of("Waterfall of the starts", partial(waterfall_svg, data, name="waterfall")),
         *moduli,
     )
-
-
-def _gradient(scale: Scale) -> str:
-    """The colours of a scale from left to right, as CSS."""
-    shades = scale.table[np.linspace(0, 255, 17).astype(int)]
-    return "linear-gradient(to right, " + ", ".join(f"rgb({r} {g} {b})" for r, g, b in shades.tolist()) + ")"
 
 
 def _photographs(drawings: Mapping[str, Callable[[], bytes]]) -> tuple[Picture, ...]:

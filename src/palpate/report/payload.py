@@ -72,7 +72,22 @@ def payload(data: ReportData, preview: Sequence[PreviewImage] = ()) -> Payload:
     low, step = _quantum(data)
     packer = _Packer(low, step)
     facts = {
-        "preview": [_preview(image, packer) for image in preview],
+        "preview": [
+            {
+                "organs": [_volume(volume, packer) for volume in image.organs],
+                "whole": [_volume(volume, packer) for volume in image.whole],
+                "greys": [_volume(volume, packer) for volume in image.greys],
+                "arrows": [
+                    {"tissue": a.tissue, "start": a.start.tolist(), "end": a.end.tolist()} for a in image.arrows
+                ],
+                "factor": image.factor,
+                "view": _box(image.view),
+                "frame": image.frame.ravel().tolist(),
+                "field": image.field.ravel().tolist(),
+                "motion": None if image.motion is None else image.motion.tolist(),
+            }
+            for image in preview
+        ],
         "roles": dict(ROLE_COLOURS),
         "low": low.tolist(),
         "step": step,
@@ -195,20 +210,6 @@ def _measured(state: MeasuredState, packer: _Packer) -> dict[str, Any]:
             }
             for of in state.points
         ],
-    }
-
-
-def _preview(image: PreviewImage, packer: _Packer) -> dict[str, Any]:
-    return {
-        "organs": [_volume(volume, packer) for volume in image.organs],
-        "whole": [_volume(volume, packer) for volume in image.whole],
-        "greys": [_volume(volume, packer) for volume in image.greys],
-        "arrows": [{"tissue": a.tissue, "start": a.start.tolist(), "end": a.end.tolist()} for a in image.arrows],
-        "factor": image.factor,
-        "view": _box(image.view),
-        "frame": image.frame.ravel().tolist(),
-        "field": image.field.ravel().tolist(),
-        "motion": None if image.motion is None else image.motion.tolist(),
     }
 
 

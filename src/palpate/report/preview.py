@@ -12,7 +12,7 @@ import numpy as np
 from palpate.errors import InputDataError
 from palpate.images.checks import VOLUME_CHANGE
 from palpate.images.registration import length_text
-from palpate.images.tissue import Role, tissue_colours
+from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.progress import about
 from palpate.report.collect import MOST_LATER
 from palpate.report.page import page_scripts, picture_of, policy_of, widths_of
@@ -85,7 +85,7 @@ def preview_page(checked: Checked, *, created: str, version: str, no_prediction:
                 "processors": cost.processors,
             },
             meshed=bool(checked.bodies),
-            tissues=tuple(_rows(shown.states, shown.looks)) if shown else (),
+            tissues=tuple(_rows(tissues, shown.looks)) if shown else (),
             names=shown.names if shown else (),
             roles=[
                 (role, ROLE_COLOURS.get(role, "#888888"), ", ".join(t.name for t in tissues if str(t.role) == role))
@@ -171,15 +171,27 @@ def _count(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
-def _rows(states: ImagedStates, looks: Sequence[TissueLook]) -> Iterator[Mapping[str, Any]]:
-    """Each tissue, as texts: who it is, what is known of it, where it lies in the images."""
-    tissues = states.before.tissues
+def _rows(tissues: tuple[Tissue, ...], looks: Sequence[TissueLook]) -> Iterator[Mapping[str, Any]]:
+    """Each tissue, as texts: who it is, what is known of it, its volume with its change and its shift in each image."""
     for tissue, look, colour in zip(tissues, looks, tissue_colours(tissues), strict=True):
         modulus = {Role.ESTIMATE: "sought", Role.KNOWN: f"{number(tissue.youngs_modulus_kpa)} kPa"}.get(
             tissue.role, NONE
         )
         if tissue.role is Role.KNOWN and tissue.modulus_sd:
             modulus += f", within a factor of {np.exp(1.96 * tissue.modulus_sd):.2g}"
+        states, first = [], look.volumes_ml[0]
+        for after, later in enumerate(look.volumes_ml[1:]):
+            change = later / first - 1.0 if first and look.middle is not None else None
+            shift = np.round(look.shifts_mm[after], 1) + 0.0 if look.shifts_mm else None
+            states.append(
+                {
+                    "volume": number(later),
+                    "change": "" if change is None else f"{round(100.0 * change, 1) + 0.0:+.1f} %",
+                    "much": change is not None and abs(change) > VOLUME_CHANGE,
+                    "shift": NONE if shift is None else f"{np.linalg.norm(look.shifts_mm[after]):.1f}",
+                    "parts": "" if shift is None else "R {:+.1f}, A {:+.1f}, S {:+.1f}".format(*shift),
+                }
+            )
         frame = "" if look.frame_mm is None else number(look.frame_mm, digits=2) if look.frame_mm >= 0.1 else "0"
         yield {
             "name": tissue.name,
@@ -190,24 +202,10 @@ def _rows(states: ImagedStates, looks: Sequence[TissueLook]) -> Iterator[Mapping
             "labels": ", ".join(map(str, tissue.labels)) or "all others",
             "modulus": modulus,
             "volume": number(look.volumes_ml[0]),
-            "states": tuple(_state(look, k) for k in range(len(states.after))),
+            "states": tuple(states),
             "frame": frame or NONE,
             "towards": frame and f"towards the {look.towards}",
         }
-
-
-def _state(look: TissueLook, after: int) -> Mapping[str, Any]:
-    """A tissue in a later image, as texts: its volume with the change, its shift with its parts."""
-    first, later = look.volumes_ml[0], look.volumes_ml[after + 1]
-    change = later / first - 1.0 if first and look.middle is not None else None
-    shift = look.shifts_mm[after] if look.shifts_mm else None
-    return {
-        "volume": number(later),
-        "change": "" if change is None else f"{round(100.0 * change, 1) + 0.0:+.1f} %",
-        "much": change is not None and abs(change) > VOLUME_CHANGE,
-        "shift": NONE if shift is None else f"{np.linalg.norm(shift):.1f}",
-        "parts": "" if shift is None else "R {:+.1f}, A {:+.1f}, S {:+.1f}".format(*(np.round(shift, 1) + 0.0)),
-    }
 
 
 def _expected(

@@ -32,6 +32,12 @@ class Scale:
         shades = mpl.colormaps[self.name](np.linspace(0.0, 1.0, 256))[:, :3]
         return np.rint(255.0 * shades).astype(np.uint8)
 
+    @property
+    def gradient(self) -> str:
+        """The colours from left to right, as CSS."""
+        shades = self.table[np.linspace(0, 255, 17).astype(int)]
+        return "linear-gradient(to right, " + ", ".join(f"rgb({r} {g} {b})" for r, g, b in shades.tolist()) + ")"
+
     def place(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where values (n,), in the unit of the scale, lie on it, 0 to 1, dimensionless; NaN stays."""
         low, high = (math.log(self.low), math.log(self.high)) if self.logarithmic else (self.low, self.high)

@@ -16,7 +16,6 @@ from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMetho
 from numpy.typing import NDArray
 
 from palpate.mesh.locate import located
-from palpate.mesh.tet_mesh import TetMesh
 from palpate.report.pictures import BESIDE_FRONT, HEIGHT, WIDTH, face_normals, section_faces
 from palpate.report.render import Triangles, render_png
 from palpate.report.report_data import MapSlice, ReportData, TissueMap
@@ -25,7 +24,6 @@ from palpate.report.section import VIEWS, Plane
 from palpate.report.svg import INK, draw_svg
 from palpate.study.map_words import RESOLVED, map_words
 from palpate.study.result import CaseResult
-from palpate.uncertainty import StiffnessMap
 
 ROOM_MM = 3.0  # round the tissue
 COLOURS = "cividis"  # which is read alike by who sees no red or green
@@ -35,36 +33,26 @@ SIDE_INCHES = 1.9
 
 def tissue_maps(result: CaseResult) -> tuple[TissueMap, ...]:
     """The maps of the first reference state, cut through the region that differs, or the tissue's middle."""
-    mesh, last = result.space.mesh, len(result.displacements)
-    return tuple(_tissue_map(result, mesh, of) for of in result.estimation.maps if of.state < last)
-
-
-def _tissue_map(result: CaseResult, mesh: TetMesh, of: StiffnessMap) -> TissueMap:
-    tissue = mesh.tissue_index(of.tissue)
-    corners = mesh.nodes[mesh.tets[of.elements]].reshape(-1, 3)
-    low, high = corners.min(axis=0) - ROOM_MM, corners.max(axis=0) + ROOM_MM
-    middle = 0.5 * (low + high) if of.region is None else of.region.centre_mm
-    mean, row = float(result.stiffness[tissue]), np.full(len(mesh.tets), -1, dtype=np.int64)
-    row[of.elements] = np.arange(len(of.elements))
-    shown = mean * np.exp(np.where(of.resolution < RESOLVED, 0.0, of.log_ratio))
-    slices = []
-    for view in VIEWS:
-        plane = Plane(view, float(middle[view.normal]), low, high)
-        tets = located(mesh, plane.points.reshape(-1, 3)).tet
-        rows = np.where(tets < 0, -1, row[tets])
-        fields = (np.append(values, np.nan)[rows] for values in (shown, of.sd, of.resolution))
-        slices.append(MapSlice(*(field.reshape(plane.points.shape[:2]).astype(np.float32) for field in fields)))
-    return TissueMap(
-        tissue,
-        map_words(of),
-        mean,
-        low,
-        high,
-        middle,
-        tuple(slices),
-        of.elements.astype(np.int32),
-        shown.astype(np.float32),
-    )
+    mesh, found = result.space.mesh, list[TissueMap]()
+    for of in (of for of in result.estimation.maps if of.state < len(result.displacements)):
+        tissue = mesh.tissue_index(of.tissue)
+        corners = mesh.nodes[mesh.tets[of.elements]].reshape(-1, 3)
+        low, high = corners.min(axis=0) - ROOM_MM, corners.max(axis=0) + ROOM_MM
+        middle = 0.5 * (low + high) if of.region is None else of.region.centre_mm
+        mean, row = float(result.stiffness[tissue]), np.full(len(mesh.tets), -1, dtype=np.int64)
+        row[of.elements] = np.arange(len(of.elements))
+        shown = mean * np.exp(np.where(of.resolution < RESOLVED, 0.0, of.log_ratio))
+        slices = list[MapSlice]()
+        for view in VIEWS:
+            plane = Plane(view, float(middle[view.normal]), low, high)
+            tets = located(mesh, plane.points.reshape(-1, 3)).tet
+            rows = np.where(tets < 0, -1, row[tets])
+            fields = (np.append(values, np.nan)[rows] for values in (shown, of.sd, of.resolution))
+            slices.append(MapSlice(*(field.reshape(plane.points.shape[:2]).astype(np.float32) for field in fields)))
+        cut = low, high, middle, tuple(slices)
+        elements = of.elements.astype(np.int32), shown.astype(np.float32)
+        found.append(TissueMap(tissue, map_words(of), mean, *cut, *elements))
+    return tuple(found)
 
 
 def map_scale(of: TissueMap, unit: str) -> Scale:

@@ -181,11 +181,7 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     parameters = parameter_map(
         models[0].space.mesh.tissues,
         models[0].regions,
-        (
-            *_blocks(case, pairs, seen),
-            *known_modulus_blocks(models[0].space.mesh.tissues, models[0].regions, tuple(range(len(models)))),
-            *_layer_blocks(case, bodies[0], models),
-        ),
+        _blocks(case, bodies[0], pairs, seen),
         loaded=case.known_force,
         open_poisson=_open_poisson(case, bodies[0].space.mesh),
         dilatation=choose_element(case.mechanics.element).dilatation,
@@ -195,10 +191,14 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
 
 def _blocks(
     case: Case,
+    body: Body,
     pairs: Sequence[tuple[LinearModel, PrescribedMotion]],
     seen: Sequence[tuple[int, tuple[Observation, ...]]],
 ) -> tuple[Block, ...]:
-    """All that is unknown beside the moduli: of each later state its motion and its drawing, then the material."""
+    """All that is unknown beside the moduli: of each later state its motion and its drawing, then the material.
+
+    The known modulus then, and one unknown an organ of all layers round it, as thick as they are in `body`.
+    """
     blocks = list[Block]()
     for s, ((_, motion), (_, observed)) in enumerate(zip(pairs, seen, strict=True)):
         blocks += [b for wall in motion.walls for b in wall_blocks(wall, s, learned=case.driver.learn_prior)]
@@ -220,12 +220,7 @@ def _blocks(
             heterogeneity_sd=case.discrepancy.heterogeneity_sd,
             poisson_sd=case.discrepancy.poisson_sd,
         )
-    return tuple(blocks) or unit_blocks(*(0 for _ in pairs))
-
-
-def _layer_blocks(case: Case, body: Body, models: Sequence[LinearModel]) -> tuple[Block, ...]:
-    """One unknown an organ, of all layers round it, as thick as they are in a body."""
-    mesh, regions = body.space.mesh, models[0].regions
+    every, mesh, regions = tuple(range(len(pairs))), body.space.mesh, pairs[0][0].regions
     numbered = list(enumerate(body.layers, start=len(mesh.tissues)))
     of = [
         (
@@ -236,7 +231,11 @@ def _layer_blocks(case: Case, body: Body, models: Sequence[LinearModel]) -> tupl
         for organ in dict.fromkeys(layer.organ for layer in body.layers)
     ]
     believed = {"sd": case.discrepancy.layer_sd, "thickness_mm": case.discrepancy.layer_mm}
-    return layer_blocks(of, tuple(range(len(models))), **believed)
+    return (
+        *(blocks or unit_blocks(*(0 for _ in pairs))),
+        *known_modulus_blocks(pairs[0][0].space.mesh.tissues, regions, every),
+        *layer_blocks(of, every, **believed),
+    )
 
 
 def _open_poisson(case: Case, mesh: TetMesh) -> tuple[str, ...]:

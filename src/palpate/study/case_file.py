@@ -40,7 +40,21 @@ def read_case(
     Raises `ConfigurationError` when the file cannot be read or says something unknown or impossible.
     """
     path = Path(path)
-    table = change(_parse(_read_text(path), str(path)))
+    try:
+        content, _ = read_input(path, LARGEST_FILE)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ConfigurationError(f"cannot read the case file {path}: {reason}; check its path") from error
+    if len(content) > LARGEST_FILE:
+        raise ConfigurationError(f"{path} is over {LARGEST_FILE} bytes long: this is no case file; give a case.toml")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(
+            f"{path} is not UTF-8 text (byte {error.start}), so it is no case.toml; from images alone an estimate needs"
+            " two or more, the one before and those after"
+        ) from error
+    table = change(_parse(text, str(path)))
     for override in overrides:
         table = _merged(table, _parse_override(override))
     table.setdefault("id", path.stem)
@@ -51,23 +65,6 @@ def read_case(
         }
     case = read_table(Case, table, where=path.name, folder=path.absolute().parent)
     return replace(case, overrides=tuple(overrides))
-
-
-def _read_text(path: Path) -> str:
-    try:
-        content, _ = read_input(path, LARGEST_FILE)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise ConfigurationError(f"cannot read the case file {path}: {reason}; check its path") from error
-    if len(content) > LARGEST_FILE:
-        raise ConfigurationError(f"{path} is over {LARGEST_FILE} bytes long: this is no case file; give a case.toml")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ConfigurationError(
-            f"{path} is not UTF-8 text (byte {error.start}), so it is no case.toml; from images alone an estimate needs"
-            " two or more, the one before and those after"
-        ) from error
 
 
 def _parse(text: str, where: str) -> dict[str, Any]:

@@ -212,26 +212,24 @@ def checked_case(
     """
     problems = _Problems()
     if isinstance(source, Case):
-        return _checked(source, problems, progress, meshed=meshed)
-    case = problems.attempt(lambda: read_case(source, overrides))
-    if case is None:
+        case = source
+    elif (read := problems.attempt(partial(read_case, source, overrides))) is not None:
+        case = read
+    else:
         return Checked(CheckReport(source.stem, problems.all()))
-    return _checked(case, problems, progress, meshed=meshed)
-
-
-def _checked(case: Case, problems: _Problems, progress: Progress, *, meshed: bool) -> Checked:
-    """The same of a case, with the problems that were found before it."""
     problems.attempt(lambda: refuse_what_cannot_be_estimated(case))
     problems.attempt(lambda: require_samples(case))
     problems.warn((*unit_warnings(case), *load_warnings(case)))
     progress("reading the images")
     whole = case.phantom is not None or case.body is not None  # nothing to read one by one
     states = problems.attempt(lambda: read_states(case, progress=progress)) if whole else None
-    read = [] if whole else _read_pairs(case, problems)
-    pairs = [states] if states is not None else [ImagedStates(before, after, (), ()) for before, after in read]
+    images = [] if whole else _read_pairs(case, problems)
+    pairs = [states] if states is not None else [ImagedStates(before, after, (), ()) for before, after in images]
     pairs = [_checked_pair(problems, pair, case, number, progress) for number, pair in enumerate(pairs, start=1)]
     firsts = np.cumsum([0, *(pair.n_later for pair in pairs)]).tolist()
-    pairs = [_with_data(problems, pair, case, first) for pair, first in zip(pairs, firsts, strict=False)]
+    for place, (pair, first) in enumerate(zip(pairs, firsts, strict=False)):
+        data = None if pair.mesh is not None else problems.attempt(partial(measured, case, pair, first=first))
+        pairs[place] = pair if data is None else replace(pair, data=data[0])
     if not pairs:
         return Checked(CheckReport(case.id, problems.all()), case)
     cost, bodies = problems.attempt(lambda: _cost(problems, pairs, case, progress, meshed=meshed)) or (None, ())
@@ -251,14 +249,6 @@ def _checked(case: Case, problems: _Problems, progress: Progress, *, meshed: boo
     measured_words = {f.name + (f", state {f.state}" if f.state > 1 else ""): words for f, words in files}
     report = CheckReport(case.id, problems.all(), names, organs, cost, tuple(found), measured_words)
     return Checked(report, case, tuple(pairs), bodies)
-
-
-def _with_data(problems: _Problems, pair: ImagedStates, case: Case, first: int) -> ImagedStates:
-    """The pair with the measurements of its later states, which are numbered after `first`."""
-    if pair.mesh is not None:
-        return pair
-    found = problems.attempt(lambda: measured(case, pair, first=first))
-    return pair if found is None else replace(pair, data=found[0])
 
 
 def _cost(
@@ -331,10 +321,15 @@ def _checked_pair(
         return states
     before, after = states.before, states.after
     names, where = later_names(len(after)), f"pair {number}: " if number > 1 else ""
-    absent = _absent([("before", before), *zip(names, after, strict=True)])
-    for tissue, images in absent.items():
+    absent: dict[str, list[str]] = {}  # tissue -> the images that do not show it, of those that must
+    for name, image in [("before", before), *zip(names, after, strict=True)]:
+        present = set(np.unique(image.index).tolist())
+        for i, tissue in enumerate(image.tissues):
+            if tissue.role in OBSERVED and i not in present:
+                absent.setdefault(tissue.name, []).append(name)
+    for lost, images in absent.items():
         text = (
-            f"{where}tissue '{tissue}' has no voxel in {' and '.join(repr(name) for name in images)}; an organ must be"
+            f"{where}tissue '{lost}' has no voxel in {' and '.join(repr(name) for name in images)}; an organ must be"
             " seen in both states: check its label in the image, or take the tissue out of the case"
         )
         problems.add(Problem(InputDataError.__name__, text, InputDataError.exit_code))
@@ -355,17 +350,6 @@ def _checked_pair(
             problems.warn(findings or (), number)
     problems.warn(every_finding(before, after, loaded=bool(case.loads)), number)
     return replace(states, before=before, after=after)
-
-
-def _absent(images: Sequence[tuple[str, Segmentation]]) -> dict[str, list[str]]:
-    """Tissue -> the images that do not show it, of those that must."""
-    missing: dict[str, list[str]] = {}
-    for name, image in images:
-        present = set(np.unique(image.index).tolist())
-        for i, tissue in enumerate(image.tissues):
-            if tissue.role in OBSERVED and i not in present:
-                missing.setdefault(tissue.name, []).append(name)
-    return missing
 
 
 def _without(image: Segmentation, absent: dict[str, list[str]]) -> Segmentation:

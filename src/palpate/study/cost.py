@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.images.distance import window_around
@@ -151,9 +150,12 @@ def tets_by_edge_length(case: Case, before: Segmentation) -> Callable[[EdgeLengt
     filler = max(tissues, key=lambda i: (not before.tissues[i].labels, before.volume(i)), default=-1)
     meshed = np.array([*(tissue.meshed for tissue in before.tissues), False])[index] & (index >= 0)
     seen = [i for i in range(len(before.tissues)) if i != filler and (index == i).any()]
-    distances = np.array([_distance_to_surface(index == i, cell)[meshed] for i in seen]).reshape(
-        len(seen), meshed.sum()
-    )
+    distances = np.empty((len(seen), np.count_nonzero(meshed)))  # mm of cells to each surface, on either side of it
+    for row, i in enumerate(seen):
+        mask = index == i
+        out = ndimage.distance_transform_edt(~mask, sampling=cell)
+        within = ndimage.distance_transform_edt(mask, sampling=cell) if not mask.all() else np.inf
+        distances[row] = np.maximum(np.where(mask, within, out) - 0.5 * float(cell.min()), 0.0)[meshed]
 
     def tets(lengths: EdgeLength) -> int:
         """With edges of that length at the organs."""
@@ -184,10 +186,3 @@ def lack_of_memory(cost: ExpectedCost) -> str:
     if has is None or cost.memory_gb <= MEMORY_FACTOR * has:
         return ""
     return f"about {cost.memory_gb:.1f} GB of memory would be needed and this machine has {has:.1f} GB"
-
-
-def _distance_to_surface(mask: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance (n_1, n_2, n_3) mm of cells to the border of `mask`, on either side of it."""
-    outside = ndimage.distance_transform_edt(~mask, sampling=cell)
-    inside = ndimage.distance_transform_edt(mask, sampling=cell) if not mask.all() else np.full(mask.shape, np.inf)
-    return np.asarray(np.maximum(np.where(mask, inside, outside) - 0.5 * float(cell.min()), 0.0))

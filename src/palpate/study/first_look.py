@@ -63,7 +63,20 @@ def tissue_looks(before: Segmentation, after: Sequence[Segmentation], box: Box) 
             continue
         middle = before.middle(i)
         shifts = tuple(image.middle(i) - middle for image in after)
-        found.append(TissueLook(i, volumes, middle, shifts, *_to_the_frame(before, i, box)))
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)  # of its voxels along the box
+        for voxels in before.voxels(i):
+            if len(voxels):
+                local = box.local(before.grid.world(voxels.astype(np.float64)))
+                low, high = np.minimum(low, local.min(axis=0)), np.maximum(high, local.max(axis=0))
+        ways = [
+            (low[a], -box.axes[a]) if end else (box.lengths[a] - high[a], box.axes[a])
+            for a, end in product(range(3), (1, 0))
+        ]
+        distance, direction = min(ways, key=lambda way: float(way[0]))
+        axis = int(np.argmax(np.abs(direction)))
+        towards = TOWARDS[axis][int(direction[axis] > 0.0)]
+        frame_mm = max(float(distance) - 0.5 * float(before.grid.spacing.max()), 0.0)
+        found.append(TissueLook(i, volumes, middle, shifts, frame_mm, towards))
     return tuple(found)
 
 
@@ -74,46 +87,23 @@ def frame_look(case: Case, before: Segmentation, after: Sequence[Segmentation]) 
     size = " × ".join(f"{length:.0f}" for length in box.lengths)
     shown = {"margin": f"{domain.margin_mm:g} mm around organs and drivers"}
     around = shown.get(domain.extent, "all that the first image shows")
-    meshed = f"The mesh fills a box of {size} mm, {around}. Its faces are the frame."
-    return FrameLook(box, (meshed, *_held(case)), shared)
-
-
-def _held(case: Case) -> tuple[str, ...]:
-    """What is held and what may move, a sentence each."""
-    domain, names = case.domain, {role: [t.name for t in case.tissues if t.role is role] for role in Role}
+    held = [f"The mesh fills a box of {size} mm, {around}. Its faces are the frame."]
+    names = {role: [t.name for t in case.tissues if t.role is role] for role in Role}
     if domain.outer_boundary == "moving":
-        frame = (
+        held.append(
             f"The frame, where the box cuts the body, may move: each point by about {domain.outer_motion_mm:g} mm,"
             f" alike over {domain.outer_kernel_mm:g} mm. The images decide how far it does."
         )
     else:
-        frame = HELD[domain.outer_boundary]
-    found = [frame]
+        held.append(HELD[domain.outer_boundary])
     if names[Role.RIGID]:
-        found.append(
+        held.append(
             f"Rigid: {', '.join(names[Role.RIGID])}. Each moves as one body by what the images show, and its surface"
             " holds what touches it."
         )
     if names[Role.DRIVER]:
         drivers = ", ".join(names[Role.DRIVER])
-        found.append(f"Driver: {drivers}. The motion of its wall moves the others; it is found from the images.")
+        held.append(f"Driver: {drivers}. The motion of its wall moves the others; it is found from the images.")
     if names[Role.VOID]:
-        found.append(f"Void: {', '.join(names[Role.VOID])}. Its surface is free.")
-    return tuple(found)
-
-
-def _to_the_frame(image: Segmentation, tissue: int, box: Box) -> tuple[float, str]:
-    """Least distance (mm) of a tissue's voxels from the faces of a box, and where the nearest face lies."""
-    half = 0.5 * float(image.grid.spacing.max())
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for voxels in image.voxels(tissue):
-        if len(voxels):
-            local = box.local(image.grid.world(voxels.astype(np.float64)))
-            low, high = np.minimum(low, local.min(axis=0)), np.maximum(high, local.max(axis=0))
-    ways = [
-        (low[a], -box.axes[a]) if end else (box.lengths[a] - high[a], box.axes[a])
-        for a, end in product(range(3), (1, 0))
-    ]
-    distance, direction = min(ways, key=lambda way: float(way[0]))
-    axis = int(np.argmax(np.abs(direction)))
-    return max(float(distance) - half, 0.0), TOWARDS[axis][int(direction[axis] > 0.0)]
+        held.append(f"Void: {', '.join(names[Role.VOID])}. Its surface is free.")
+    return FrameLook(box, tuple(held), shared)

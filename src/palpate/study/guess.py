@@ -90,7 +90,16 @@ def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple
             guesses[i] = replace(guess, name=SURROUNDINGS, role=Role.KNOWN, reason=reason)
     guesses = _with_driver(_with_one_skeleton(guesses), before, after)
     outside = [g for g in guesses if g.role is Role.VOID]
-    rest = [g for g in guesses if g.name == SURROUNDINGS]
+    surroundings = list[GuessedTissue]()
+    rest = [before.names.get(g.labels[0], f"label {g.labels[0]}") for g in guesses if g.name == SURROUNDINGS]
+    fat, muscle = usual_stiffness("fat"), usual_stiffness("muscle")
+    if rest and fat is not None and muscle is not None:  # both stand in the table
+        value = round(float(np.sqrt(fat.usual_kpa * muscle.usual_kpa)), 2)
+        reason = (
+            f"all that no other tissue names ({', '.join(rest)}); {value:g} kPa lies between fat and muscle"
+            f" ({muscle.reference})"
+        )
+        surroundings = [GuessedTissue(SURROUNDINGS, (), Role.KNOWN, reason, value)]
     organs = [g for g in guesses if g.role is not Role.VOID and g.name != SURROUNDINGS]
     roles = (Role.ESTIMATE, Role.DRIVER, Role.RIGID, None, Role.KNOWN)
     tumours = [g for g in organs if g.role is Role.ESTIMATE and "tumour" in g.reason]
@@ -100,7 +109,7 @@ def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple
     # every name once, and none that a case file does not take for a tissue
     found: list[GuessedTissue] = []
     taken: set[str] = set()
-    for guess in [*others, *_surroundings(rest, before), *known, *outside]:
+    for guess in [*others, *surroundings, *known, *outside]:
         number = guess.labels[0] if guess.labels else "rest"
         name = guess.name if is_tissue_name(guess.name) else f"label {number}"
         name = name if name not in taken else f"{name[: MAX_NAME - 10]} {number}"
@@ -211,22 +220,6 @@ def _with_one_skeleton(guesses: list[GuessedTissue]) -> list[GuessedTissue]:
     )
     whole = GuessedTissue("bones", labels, Role.RIGID, reason)
     return [whole if guess is bones[0] else guess for guess in guesses if guess not in bones[1:]]
-
-
-def _surroundings(rest: list[GuessedTissue], before: LabelImage) -> list[GuessedTissue]:
-    """One tissue for all that is left, with a modulus between those of fat and muscle."""
-    if not rest:
-        return []
-    fat, muscle = usual_stiffness("fat"), usual_stiffness("muscle")
-    if fat is None or muscle is None:  # both stand in the table
-        return []
-    value = round(float(np.sqrt(fat.usual_kpa * muscle.usual_kpa)), 2)
-    named = [before.names.get(g.labels[0], f"label {g.labels[0]}") for g in rest]
-    reason = (
-        f"all that no other tissue names ({', '.join(named)}); {value:g} kPa lies between fat and muscle"
-        f" ({muscle.reference})"
-    )
-    return [GuessedTissue(SURROUNDINGS, (), Role.KNOWN, reason, value)]
 
 
 @dataclass(frozen=True, slots=True)

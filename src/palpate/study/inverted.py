@@ -46,11 +46,16 @@ def inverted(
         if not found.minimum.converged:
             return found
         there(f"the reference without its loads, pass {number}")
-        theta = _theta(found)
-        strained = [
-            strained_body(body, _unloaded(body, reference, problem, found, case), case)
-            for reference, body in enumerate(bodies)
-        ]
+        theta, strained = _theta(found), list[Body]()
+        parameters, unknowns = found.objective.parameters, found.minimum.unknowns
+        for reference, body in enumerate(bodies):
+            first = next(i for i, state in enumerate(problem.states) if state.reference == reference)
+            model, seen = problem.states[first].finite_strain, found.objective.states[first].model
+            assert model is not None
+            own, borne = replace(model, material=seen.material), case_loads(case, body.space, 0)
+            coefficients = parameters.coefficients(unknowns)[first][seen.constraint.n_modes :]
+            moved = unloaded_displacement(own, parameters.moduli(unknowns), coefficients, borne)
+            strained.append(strained_body(body, moved, case))
         problem = joint_problem(strained, case, progress=there)
         found = invert(problem, replace(settings, starts=(theta,), further=()), progress=there, rule=rule)
         change = float(np.abs(_theta(found) - theta).max())
@@ -65,14 +70,3 @@ def inverted(
 def _theta(found: Inversion) -> NDArray[np.float64]:
     """The log-moduli (n_parameters,) of the best minimum."""
     return np.asarray(found.minimum.unknowns[: found.objective.n_parameters])
-
-
-def _unloaded(body: Body, reference: int, problem: InverseProblem, found: Inversion, case: Case) -> NDArray[np.float64]:
-    """How far (n_points, 3) mm the loads of its reference state have moved a body with the moduli that were found."""
-    parameters, unknowns = found.objective.parameters, found.minimum.unknowns
-    first = next(i for i, state in enumerate(problem.states) if state.reference == reference)
-    model, seen = problem.states[first].finite_strain, found.objective.states[first].model
-    assert model is not None
-    coefficients = parameters.coefficients(unknowns)[first][seen.constraint.n_modes :]
-    own = replace(model, material=seen.material)
-    return unloaded_displacement(own, parameters.moduli(unknowns), coefficients, case_loads(case, body.space, 0))

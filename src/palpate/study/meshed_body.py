@@ -23,7 +23,7 @@ from palpate.observation.measured_motion import measured_motion
 from palpate.observation.measured_points import MeasuredPoints
 from palpate.progress import Progress
 from palpate.study.case import Case
-from palpate.study.case_body import CaseSurface, MeshBody
+from palpate.study.case_body import MeshBody
 from palpate.study.imaged import ImagedStates
 from palpate.study.schema import nearest
 
@@ -96,19 +96,19 @@ def _mesh(file: MeshFile, case: Case) -> TetMesh:
             f"no tissue of the case has the group(s) {[groups[n] for n in left]} of the mesh; give each a tissue,"
             ' or one label = "remaining"'
         )
-    faces = boundary_of(file.tets)
-    surfaces = {surface.name: _faces(file, faces, surface) for surface in case.surfaces}
+    faces, surfaces = boundary_of(file.tets), dict[str, NDArray[np.bool_]]()  # which (n_boundary,) belong to each
+    for surface in case.surfaces:
+        if surface.where in (WHOLE, *PLANES):
+            surfaces[surface.name] = plane_faces(file.nodes, faces, surface.where, surface.within_mm)
+            continue
+        if surface.where not in file.surfaces:
+            known = nearest(surface.where, [WHOLE, *PLANES, *file.surfaces])
+            raise ConfigurationError(
+                f"[[surfaces]] '{surface.name}': the mesh has no surface '{surface.where}': {known}"
+            )
+        listed = {tuple(face) for face in np.sort(file.surfaces[surface.where], axis=1).tolist()}
+        there = [tuple(face) in listed for face in np.sort(faces, axis=1).tolist()]
+        surfaces[surface.name] = np.array(there, dtype=bool)
     tissues += [surface.behind for surface in case.surfaces]
     tissues.append(Tissue(OUTSIDE, Role.VOID))
     return body_mesh(file, tissues, region, surfaces, len(tissues) - 1)
-
-
-def _faces(file: MeshFile, faces: NDArray[np.int64], surface: CaseSurface) -> NDArray[np.bool_]:
-    """Which boundary faces (n_boundary, 3) belong to a surface of the case."""
-    if surface.where in (WHOLE, *PLANES):
-        return plane_faces(file.nodes, faces, surface.where, surface.within_mm)
-    if surface.where not in file.surfaces:
-        known = nearest(surface.where, [WHOLE, *PLANES, *file.surfaces])
-        raise ConfigurationError(f"[[surfaces]] '{surface.name}': the mesh has no surface '{surface.where}': {known}")
-    own = {tuple(face) for face in np.sort(file.surfaces[surface.where], axis=1).tolist()}
-    return np.array([tuple(face) in own for face in np.sort(faces, axis=1).tolist()], dtype=bool)

@@ -162,7 +162,13 @@ def _organs(first: LabelImage, second: LabelImage) -> tuple[Segmentation, Segmen
     An organ is a label by its name, or where an image has none by its number, other than 0 and the one that covers most
     of the image's border.
     """
-    numbers = [_numbers(image, named=bool(first.names and second.names)) for image in (first, second)]
+    numbers = list[dict[str, int]]()  # the label of each organ of an image
+    for image in (first, second):
+        layers = [np.take(image.labels, end, axis).ravel() for axis in range(3) for end in (0, -1)]
+        values, counts = np.unique(np.concatenate(layers), return_counts=True)
+        around = {0, int(values[np.argmax(counts)])}
+        present = sorted({int(n) for layer in image.labels for n in np.unique(layer)} - around)
+        numbers.append({image.names.get(n, f"label {n}"): n for n in present})
     both = [name for name in numbers[0] if name in numbers[1]]
     alone = tuple(sorted(set(numbers[0]) ^ set(numbers[1])))
     if not both:
@@ -174,15 +180,6 @@ def _organs(first: LabelImage, second: LabelImage) -> tuple[Segmentation, Segmen
     tissues = [(rest, *(Tissue(name, Role.ESTIMATE, (found[name],)) for name in both)) for found in numbers]
     before, after = (segment(image, own) for image, own in zip((first, second), tissues, strict=True))
     return before, after, alone
-
-
-def _numbers(image: LabelImage, *, named: bool) -> dict[str, int]:
-    """The label of each organ of an image."""
-    layers = [np.take(image.labels, end, axis).ravel() for axis in range(3) for end in (0, -1)]
-    values, counts = np.unique(np.concatenate(layers), return_counts=True)
-    around = {0, int(values[np.argmax(counts)])}
-    present = sorted({int(n) for layer in image.labels for n in np.unique(layer)} - around)
-    return {image.names.get(n, f"label {n}") if named or n in image.names else f"label {n}": n for n in present}
 
 
 def _maps(before: Segmentation, after: Segmentation, tissue: int, width: float) -> tuple[DistanceMap, DistanceMap]:

@@ -125,18 +125,14 @@ def background_of(
     if ct is not None and shows_air(ct[0]):
         outside = outside_body(*ct, image.grid)[window]
         return Background(share, float(np.count_nonzero(outside & zero) / np.count_nonzero(zero)), seen=True)
+    labelled = np.argwhere(image.labels != 0)
     places = np.argwhere(zero) + np.array([s.start for s in window], dtype=np.int64)
-    return Background(share, _beyond_hull(np.argwhere(image.labels != 0), places), seen=False)
-
-
-def _beyond_hull(labelled: NDArray[np.int64], places: NDArray[np.int64]) -> float:
-    """Share of the voxels `places` (n, 3) outside the convex hull of the voxels `labelled` (m, 3)."""
     try:
         hull = ConvexHull(labelled[:: -(-len(labelled) // CORNERS)])
     except (QhullError, ValueError):  # all in one plane
-        return 1.0
+        return Background(share, 1.0, seen=False)
     chosen = places[:: -(-len(places) // SAMPLES)]
     beyond = np.zeros(len(chosen), dtype=np.bool_)
     for *normal, offset in hull.equations:
         beyond |= chosen @ np.array(normal) + offset > 0.0
-    return float(beyond.mean())
+    return Background(share, float(beyond.mean()), seen=False)

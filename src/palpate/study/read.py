@@ -10,7 +10,6 @@ import numpy as np
 
 from palpate.errors import ConfigurationError
 from palpate.images.body_in_ct import outside_body
-from palpate.images.label_image import LabelImage
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.readers.registry import format_of
@@ -65,9 +64,16 @@ def read_segmentation(
     `names`: the label table (label -> name), if the case has one; an image that brings its own names is read by those.
     `tissues`: those of the reference image, for an image without names. Raises as `read_states` does.
     """
-    grey = _grey(case, path) if format_of(path).read_on is not None else None  # for files that may lack their grid
-    grid = read_intensities(grey)[1] if grey is not None else None
-    image = _with_body(read_label_image(path, names=names, grid=grid), case, path)
+    grey = _grey(case, path)
+    on = grey if format_of(path).read_on is not None else None  # for files that may lack their grid
+    image = read_label_image(path, names=names, grid=None if on is None else read_intensities(on)[1])
+    if case.images is not None and case.images.body_from_ct:  # label 0 inside the body as one that no tissue claims
+        body = image.labels == 0
+        if grey is not None:
+            body &= ~outside_body(*read_intensities(grey), image.grid)
+        claimed = [label for tissue in case.resolve_tissues(image.names) for label in tissue.labels]
+        number = 1 + max(int(image.labels.max()), *claimed)
+        image = replace(image, labels=np.where(body, np.int32(number), image.labels))
     found = segment(image, case.resolve_tissues(image.names) if tissues is None or image.names else tissues)
     refuse_large(found, path)
     return found
@@ -80,18 +86,6 @@ def _grey(case: Case, path: Path) -> Path | None:
         return None
     later = dict(zip(images.after, images.intensities_after, strict=False))
     return images.intensities_before if path == images.before else later.get(path)
-
-
-def _with_body(image: LabelImage, case: Case, path: Path) -> LabelImage:
-    """The image with label 0 inside the body as a label that no tissue claims, if the case wants it so."""
-    if case.images is None or not case.images.body_from_ct:
-        return image
-    body, grey = image.labels == 0, _grey(case, path)
-    if grey is not None:
-        body &= ~outside_body(*read_intensities(grey), image.grid)
-    claimed = [label for tissue in case.resolve_tissues(image.names) for label in tissue.labels]
-    number = 1 + max(int(image.labels.max()), *claimed)
-    return replace(image, labels=np.where(body, np.int32(number), image.labels))
 
 
 def phantom_scene(case: Case) -> Scene:

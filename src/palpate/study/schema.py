@@ -187,15 +187,11 @@ def _convert(hint: Any, value: object, place: _Place) -> object:
         if word not in list(hint):
             raise ConfigurationError(f"{place} is '{shortened(word)}': {nearest(word, list(hint))}")
         return hint(word)
-    return _convert_plain(hint, value, place)
-
-
-def _convert_plain(hint: Any, value: object, place: _Place) -> object:
     wanted = {float: "a number", int: "a whole number", str: "text in quotes", bool: "true or false"}[hint]
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
     if hint is not bool and isinstance(value, bool):  # to Python, true is the number 1
         raise ConfigurationError(f"{place} is {shown(value)}, but it must be {wanted}")
+    if hint is float and isinstance(value, int):
+        value = float(value)
     return _expect(value, hint, wanted, place=place)
 
 

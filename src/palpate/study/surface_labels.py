@@ -69,7 +69,14 @@ def surface_labels(
             " names, which are those of the organs"
         )
     surfaces = [read_stl(file, axes=axes) for file in files]
-    grid = like or _grid(surfaces, spacing_mm, margin_mm)
+    grid = like
+    if grid is None:  # cubes along RAS that hold all surfaces and the margin
+        low = np.min([surface.points.min(axis=0) for surface in surfaces], axis=0) - margin_mm
+        high = np.max([surface.points.max(axis=0) for surface in surfaces], axis=0) + margin_mm
+        shape = np.ceil((high - low) / spacing_mm)
+        affine = np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0])
+        affine[:3, 3] = low + 0.5 * spacing_mm
+        grid = VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
     if (size := float(np.prod([float(n) for n in grid.shape]))) > MOST_VOXELS:
         raise ResourceError(
             f"the grid would have {size:.3g} voxels, over {MOST_VOXELS}; take larger ones, or less margin"
@@ -92,16 +99,6 @@ def surface_labels(
         held = float(abs(np.einsum("ni,ni->n", a, np.cross(b, c)).sum()) / 6.0)
         volumes[name] = (held, insides[name] * grid.voxel_volume)
     return SurfaceLabels(image, volumes)
-
-
-def _grid(surfaces: Sequence[SurfaceFile], spacing_mm: float, margin_mm: float) -> VoxelGrid:
-    """Cubes of an edge along RAS that hold all surfaces and a margin."""
-    low = np.min([surface.points.min(axis=0) for surface in surfaces], axis=0) - margin_mm
-    high = np.max([surface.points.max(axis=0) for surface in surfaces], axis=0) + margin_mm
-    shape = np.ceil((high - low) / spacing_mm)
-    affine = np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0])
-    affine[:3, 3] = low + 0.5 * spacing_mm
-    return VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
 
 
 def _inside(surface: SurfaceFile, grid: VoxelGrid) -> NDArray[np.bool_]:

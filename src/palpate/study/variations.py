@@ -20,7 +20,6 @@ from palpate.parallel import mapped
 from palpate.uncertainty import (
     Equilibria,
     Errors,
-    FastPath,
     Shift,
     exact_equilibria,
     fast_path,
@@ -123,9 +122,17 @@ def fast_variations(
     """
     path = fast_path(inversion.objective, inversion.minimum, settings.bounds)
     names, equilibria = inversion.objective.parameters.tissues, _equilibria(inversion)
+    inputs = _inputs(inversion, equilibria, tissues, dilatation, voxel_mm)
+
+    def vary(job: tuple[_Input, float, str]) -> Variation:
+        """One input changed by one of its amounts."""
+        each, amount, words = job
+        errors = tuple(amount * error for error in each.errors)
+        return _stated(names, (each.cause, each.subject, words), partial(path.under, errors))
+
     found = [
         *_exact(inversion, tissues),
-        *_varied(path, names, _inputs(inversion, equilibria, tissues, dilatation, voxel_mm)),
+        *mapped(vary, [(each, *amount) for each in inputs for amount in each.amounts]),
         *(Variation("segmentation", name, "any", "linearised", None, reason=DRAWN) for name in _offset(inversion)),
     ]
     if inversion.objective.parameters.n_coefficients:
@@ -250,19 +257,6 @@ def _ranges(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Range]:
 
 def _equilibria(inversion: Inversion) -> Equilibria:
     return exact_equilibria(inversion.objective, inversion.minimum.unknowns)
-
-
-def _varied(path: FastPath, names: tuple[str, ...], inputs: Sequence[_Input]) -> list[Variation]:
-    """Every input changed by each of its amounts."""
-    jobs = [(each, amount, words) for each in inputs for amount, words in each.amounts]
-
-    def vary(job: tuple[_Input, float, str]) -> Variation:
-        """One of them."""
-        each, amount, words = job
-        errors = tuple(amount * error for error in each.errors)
-        return _stated(names, (each.cause, each.subject, words), partial(path.under, errors))
-
-    return mapped(vary, jobs)
 
 
 def _inputs(

@@ -123,7 +123,11 @@ def estimates_of(
         by_ratio = _without(of_scale, of.interval, value, centre=float(np.exp(theta - shift)))
         word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
         if word != "identified" and of_scale > 0.0:
-            word, why = _of_range(word, why, verdict(by_ratio, at_bound=of.at_bound, absolute=True))
+            # the ratio may say more than a modulus whose scale is known within a range alone
+            ratio_word, ratio_why = verdict(by_ratio, at_bound=of.at_bound, absolute=True)
+            if ratio_word not in (NOT_IDENTIFIED, word):
+                left = "the range of the known modulus leaves more of it open in kPa"
+                word, why = "ratio only", f"of the ratio {ratio_why}; {left}"
         if not layers_told and word != NOT_IDENTIFIED:
             word = "weak" if word == "identified" else word
             why = f"{why}, but does not hold what layers round the organs would do (warning `unsettled`)"
@@ -159,13 +163,6 @@ def _without(sd: float, interval: Interval, value: float, *, centre: float) -> I
         None if low is None else float(centre * np.exp(-low)),
         None if high is None else float(centre * np.exp(high)),
     )
-
-
-def _of_range(word: str, why: str, of_ratio: tuple[str, str]) -> tuple[str, str]:
-    """The verdict on a modulus whose scale is known within a range alone: the ratio may say more."""
-    if of_ratio[0] == NOT_IDENTIFIED or of_ratio[0] == word:
-        return word, why
-    return "ratio only", f"of the ratio {of_ratio[1]}; the range of the known modulus leaves more of it open in kPa"
 
 
 def _stated(interval: Interval, word: str, unit: float = 1.0) -> Interval | None:

@@ -98,9 +98,20 @@ class SlurmEngine:
         parts = [[asdict(task) for task in tasks[number::count]] for number in range(count)]
         memory_mb = math.ceil(1000.0 * (max(mapped(_memory_gb, tasks)) + HOLD_GB))
         place = (self.folder / FOLDER).absolute()
+        command = shlex.join([*self.command, "cohort", "--quiet", "--output", str(self.folder.absolute())])
+        script = [
+            "#!/bin/sh",
+            "#SBATCH --job-name=palpate",
+            f"#SBATCH --array=0-{count - 1}{f'%{self.workers}' if self.workers else ''}",
+            "#SBATCH --ntasks=1 --cpus-per-task=1",
+            f"#SBATCH --mem={memory_mb}M",
+            f"#SBATCH --output={place}/%A_%a.log",
+            "#SBATCH --requeue",
+            f'exec {command} --task "$SLURM_ARRAY_TASK_ID"',
+        ]
         with staged(place) as staging:
             write_json(staging.area / PARTS, {"schema": "palpate.parts/1", "parts": parts})
-            write_text(staging.area / SCRIPT, self._script(count, memory_mb, place))
+            write_text(staging.area / SCRIPT, "\n".join(script) + "\n")
             staging.commit()
         job = _run("sbatch", "--parsable", str(place / SCRIPT)).split(";")[0].strip()
         if not JOB_NUMBER.fullmatch(job):
@@ -109,21 +120,6 @@ class SlurmEngine:
             write_json(staging.area / JOB, {"schema": "palpate.job/1", "job": job})
             staging.commit()
         return job
-
-    def _script(self, count: int, memory_mb: int, place: Path) -> str:
-        most = f"%{self.workers}" if self.workers else ""
-        command = shlex.join([*self.command, "cohort", "--quiet", "--output", str(self.folder.absolute())])
-        lines = [
-            "#!/bin/sh",
-            "#SBATCH --job-name=palpate",
-            f"#SBATCH --array=0-{count - 1}{most}",
-            "#SBATCH --ntasks=1 --cpus-per-task=1",
-            f"#SBATCH --mem={memory_mb}M",
-            f"#SBATCH --output={place}/%A_%a.log",
-            "#SBATCH --requeue",
-            f'exec {command} --task "$SLURM_ARRAY_TASK_ID"',
-        ]
-        return "\n".join(lines) + "\n"
 
 
 def run_part(folder: Path, number: int, progress: Progress) -> list[Outcome]:

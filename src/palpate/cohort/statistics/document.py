@@ -42,21 +42,41 @@ def statistics_document(records: Sequence[Record]) -> dict[str, Any]:
     tissues = [usable_scans(records, tissue) for tissue in tissues_of(records)]
     states = Counter(record.state for record in records)
     classes = Counter(record.failure_class for record in records if record.failure_class)
+    holders: dict[str, list[tuple[Row, str]]] = {}  # of each image
+    numeric: dict[str, dict[str, float]] = {}  # of the table's further columns: name -> id of a row -> number
+    for record in records:
+        for key, digest in record.images.items():
+            holders.setdefault(digest, []).append((record.row, key))
+        for name, text in record.row.covariates.items():
+            try:
+                number = float(text)
+            except ValueError:
+                number = math.nan
+            numeric.setdefault(name, {})[record.row.id] = number
+    covariates = {name: of for name, of in numeric.items() if any(map(math.isfinite, of.values()))}
     document = {
         "schema": SCHEMA,
         "unit_of_analysis": "patient",
         "rows": {"in": len(records), **{state: states[state] for state in ("done", "failed", "waiting")}},
         "failed_by_class": dict(classes),
-        "identical_images": _identical_images(records),
+        "identical_images": [  # that several patients share: an image that was copied, or one patient twice
+            {
+                "sha256": digest,
+                "patients": patients,
+                "rows": [{"id": row.id, "image": key} for row, key in held],
+            }
+            for digest, held in holders.items()
+            if len(patients := list(dict.fromkeys(row.patient for row, _ in held))) > 1
+        ],
         "patients": _patients(records, tissues),
-        "organs": {usable.tissue: _organ(usable, records) for usable in tissues},
+        "organs": {usable.tissue: _organ(usable, covariates) for usable in tissues},
         "paper": {usable.tissue: _as_the_paper(usable) for usable in tissues},
         "notes": NOTES,
     }
     return json_object(document)
 
 
-def _organ(usable: Usable, records: Sequence[Record]) -> dict[str, Any]:
+def _organ(usable: Usable, covariates: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
     staged = [patient for patient in usable.patients if usable.stage_of(patient) is not None]
     lows, highs = ([np.array([getattr(s, end) for s in usable.of(p)]) for p in staged] for end in ("low", "high"))
     stages = np.array([float(usable.stage_of(patient) or 0) for patient in staged])
@@ -64,7 +84,6 @@ def _organ(usable: Usable, records: Sequence[Record]) -> dict[str, Any]:
     remarks = [f"{len(several)} patients have rows of several stages: nothing by stage uses them"] if several else []
     without = len(usable.patients) - len(staged) - len(several)
     remarks += [f"{without} patients have no stage"] if without else []
-    covariates = _numeric_covariates(records)
     clean = [scan for scan in usable.scans if not set(scan.warnings) & set(MISLEADING)]
     warned = len(clean) < len(usable.scans)
     censored = sum(scan.value is None for scan in usable.scans)
@@ -77,6 +96,8 @@ def _organ(usable: Usable, records: Sequence[Record]) -> dict[str, Any]:
         counts = {"n_patients": len({scan.patient for scan in scans}), "n_scans": len(scans)}
         counts["n_censored"] = sum(scan.value is None for scan in scans)
         found.append({"stage": stage, **counts, "q25": low, "median": middle, "q75": high})
+    without_warned = stage_regression(clean, seed=SEED) if warned else {}
+    untested = {key: value for key, value in without_warned.items() if key not in ("p", "arrangements", "exact")}
     return {
         "unit": usable.unit,
         "used": {"scans": len(usable.scans), "patients": len(usable.patients), "censored": censored},
@@ -87,32 +108,10 @@ def _organ(usable: Usable, records: Sequence[Record]) -> dict[str, Any]:
         **asdict(association(lows, highs, stages)),
         "regression": stage_regression(usable.scans, seed=SEED),
         "regression_adjusted": adjusted if adjusted is None or adjusted.get("covariates", True) else None,
-        "regression_without_warned": _untested(stage_regression(clean, seed=SEED)) if warned else None,
+        "regression_without_warned": untested if warned else None,
         "repeatability": repeatability(usable),
         "by_stage": found,
     }
-
-
-def _untested(regression: dict[str, Any]) -> dict[str, Any]:
-    """A regression that is there to be compared, without its test."""
-    return {key: value for key, value in regression.items() if key not in ("p", "arrangements", "exact")}
-
-
-def _identical_images(records: Sequence[Record]) -> list[dict[str, Any]]:
-    """Images that rows of several patients share to the byte: an image that was copied, or one patient twice."""
-    holders: dict[str, list[tuple[Row, str]]] = {}
-    for record in records:
-        for key, digest in record.images.items():
-            holders.setdefault(digest, []).append((record.row, key))
-    return [
-        {
-            "sha256": digest,
-            "patients": patients,
-            "rows": [{"id": row.id, "image": key} for row, key in held],
-        }
-        for digest, held in holders.items()
-        if len(patients := list(dict.fromkeys(row.patient for row, _ in held))) > 1
-    ]
 
 
 def _patients(records: Sequence[Record], tissues: Sequence[Usable]) -> list[dict[str, Any]]:
@@ -125,26 +124,20 @@ def _patients(records: Sequence[Record], tissues: Sequence[Usable]) -> list[dict
         entry |= {"sessions": [row.session for row in rows], "kpa": {}, "ratio": {}, "summary": {}}
         for usable in tissues:
             if scans := usable.of(patient):
-                values = [scan.value for scan in scans if scan.value is not None]
-                entry["kpa" if usable.unit == "kPa" else "ratio"][usable.tissue] = values
-                entry["summary"][usable.tissue] = _summary(scans)
+                valued = [scan for scan in scans if scan.value is not None]
+                values = np.array([scan.low for scan in valued])
+                inside = inside_fences(values) if valued else np.zeros(0, dtype=bool)
+                entry["kpa" if usable.unit == "kPa" else "ratio"][usable.tissue] = [scan.value for scan in valued]
+                entry["summary"][usable.tissue] = {  # null is what their values alone do not tell
+                    "n": len(scans),
+                    "outliers": int((~inside).sum()),
+                    "median": _quantiles(scans)[1],
+                    "mean_as_the_paper": float(values[inside].mean()) if valued else None,
+                    "combined": asdict(combined(valued)) if valued else None,
+                    "censored": [[scan.low95, scan.high95] for scan in scans if scan.value is None],
+                }
         found.append(entry)
     return found
-
-
-def _summary(scans: Sequence[Scan]) -> dict[str, Any]:
-    """A patient's scans of one tissue together; null is what their values alone do not tell."""
-    valued = [scan for scan in scans if scan.value is not None]
-    values = np.array([scan.low for scan in valued])
-    inside = inside_fences(values) if valued else np.zeros(0, dtype=bool)
-    return {
-        "n": len(scans),
-        "outliers": int((~inside).sum()),
-        "median": _quantiles(scans)[1],
-        "mean_as_the_paper": float(values[inside].mean()) if valued else None,
-        "combined": asdict(combined(valued)) if valued else None,
-        "censored": [[scan.low95, scan.high95] for scan in scans if scan.value is None],
-    }
 
 
 def _as_the_paper(usable: Usable) -> dict[str, Any]:
@@ -166,16 +159,3 @@ def _quantiles(scans: Sequence[Scan]) -> list[float | None]:
     with np.errstate(invalid="ignore"):
         ends = [np.percentile([getattr(scan, end) for scan in scans], [25.0, 50.0, 75.0]) for end in ("low", "high")]
     return [float(low) if low == high else None for low, high in zip(*ends, strict=True)]
-
-
-def _numeric_covariates(records: Sequence[Record]) -> Mapping[str, Mapping[str, float]]:
-    """Name -> id of a row -> number, of the table's further columns that are numbers."""
-    found: dict[str, dict[str, float]] = {}
-    for record in records:
-        for name, text in record.row.covariates.items():
-            try:
-                number = float(text)
-            except ValueError:
-                number = math.nan
-            found.setdefault(name, {})[record.row.id] = number
-    return {name: numbers for name, numbers in found.items() if any(map(math.isfinite, numbers.values()))}

@@ -44,7 +44,12 @@ def stage_regression(
     one = sorted(patient for patient, of in stages.items() if len(of) == 1 and None not in of)
     kept = sorted((scan for scan in scans if scan.patient in one), key=lambda scan: (scan.patient, scan.id))
     x = np.array([float(next(iter(stages[patient])) or 0) for patient in one])
-    beside = {name: means for name, of in (covariates or {}).items() if (means := _means(kept, one, of)) is not None}
+    beside = dict[str, Array]()
+    for name, of_scans in (covariates or {}).items():
+        found_of = [[of_scans.get(scan.id, np.nan) for scan in kept if scan.patient == patient] for patient in one]
+        means = np.array([np.mean(numbers) for numbers in found_of])
+        if np.isfinite(means).all() and len(means) and np.ptp(means) > 0.0:
+            beside[name] = means
     if words := _undefined(kept, x, 2 + len(beside)):
         return {"undefined": words}
     regression = _Regression(_Data.of(kept, one), x - x.mean(), np.array([np.ones(len(x)), *beside.values()]).T, seed)
@@ -228,13 +233,6 @@ class _Regression:
         return np.asarray(
             optimize.minimize(negative, start if near is None else near, bounds=bounds, method="L-BFGS-B").x
         )
-
-
-def _means(scans: Sequence[Scan], patients: Sequence[str], of: Mapping[str, float]) -> Array | None:
-    """Each patient's mean of a covariate (n,); None where a scan has none, or all have the same."""
-    found = [[of.get(scan.id, np.nan) for scan in scans if scan.patient == patient] for patient in patients]
-    means = np.array([np.mean(numbers) for numbers in found])
-    return means if np.isfinite(means).all() and len(means) and np.ptp(means) > 0.0 else None
 
 
 def _undefined(scans: Sequence[Scan], x: Array, coefficients: int) -> str:
