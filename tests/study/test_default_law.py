@@ -41,7 +41,7 @@ def squeezed(folder, seed):
     return folder / "case.toml"
 
 
-@pytest.mark.parametrize(("seed", "samples"), [(1, 200), (2, 0)])
+@pytest.mark.parametrize(("seed", "samples"), [(1, 200), (2, 0), (3, 0)])
 def test_the_default_law_finds_the_moduli_of_a_body_at_finite_strain(seed, samples, tmp_path):
     result = estimate(read_case(squeezed(tmp_path, seed), [f"estimate.samples={samples}"]))
     assert (result.case.mechanics.law, result.case.mechanics.element) == (LAW, "auto")
