@@ -3,7 +3,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from palpate.errors import GeometryError
+from palpate.errors import GeometryError, ResourceError
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.anatomy import Anatomy, Box
 from palpate.mesh.quality import check_mesh
@@ -62,10 +62,11 @@ def test_the_same_anatomy_gives_the_same_mesh_in_whatever_room_mmg_takes(coarse,
     assert np.array_equal(wide.tets, coarse.tets)
 
 
-def test_mmg_without_room_is_an_error_that_says_what_to_do(anatomy, monkeypatch):
+def test_mmg_without_room_is_a_lack_of_memory_that_says_what_to_do(anatomy, monkeypatch, capfd):
     monkeypatch.setattr("palpate.mesh.remeshing.SMALL_MB", 16)
-    with pytest.raises(GeometryError, match=r"try another mesh\.edge_length_mm"):
+    with pytest.raises(ResourceError, match=r"make mesh\.edge_length_mm larger"):
         tetrahedralise(anatomy, edge_length_mm=8.0)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_the_wall_of_the_driver_is_known_from_the_cut_of_the_image(mesh):

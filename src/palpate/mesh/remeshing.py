@@ -14,7 +14,7 @@ import numpy as np
 from mmgpy import MmgMesh3D
 from numpy.typing import NDArray
 
-from palpate.errors import GeometryError
+from palpate.errors import GeometryError, ResourceError
 from palpate.mesh.anatomy import Box
 from palpate.mesh.cutting import Grid
 from palpate.mesh.tet_mesh import FACES
@@ -64,7 +64,8 @@ def _others_take_none(numbers: tuple[signal.Signals, ...]) -> bool:
 def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float) -> Grid:
     """The same regions in tetrahedra of edge length `sizes` (n_nodes,) mm, by Mmg (Dapogny, Dobrzynski, Frey 2014).
 
-    Surfaces move by no more than about `sag_mm`. Raises `GeometryError` when Mmg gives up.
+    Surfaces move by no more than about `sag_mm`. Raises `GeometryError` when Mmg gives up, `ResourceError` when
+    it has no memory for what it is given.
     """
     mesh = MmgMesh3D()
     corners = grid.nodes[grid.tets]
@@ -82,13 +83,20 @@ def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float)
     ridges = unique[count > 1]
     n_nodes, n_tets = len(grid.nodes), len(grid.tets)
     try:
-        mesh.set_mesh_size(vertices=n_nodes, tetrahedra=n_tets, triangles=len(triangles), edges=len(ridges))
+        with _silent():
+            mesh.set_mesh_size(vertices=n_nodes, tetrahedra=n_tets, triangles=len(triangles), edges=len(ridges))
         mesh.set_vertices(grid.nodes)
         mesh.set_tetrahedra(grid.tets.astype(np.int32), (grid.region + 1).astype(np.int32))
         mesh.set_triangles(triangles.astype(np.int32), references.astype(np.int32))
         mesh.set_edges(ridges.astype(np.int32))
         mesh.set_ridge_edges(np.arange(len(ridges), dtype=np.int32))
         mesh["metric"] = sizes[:, None]
+    except RuntimeError as error:
+        raise ResourceError(
+            f"the mesher has no memory for {n_tets} tetrahedra ({error}); make mesh.edge_length_mm larger, or end other"
+            " programs"
+        ) from error
+    try:
         with interrupts_held(), _silent():
             mesh.remesh(
                 hmin=0.4 * float(sizes.min()),

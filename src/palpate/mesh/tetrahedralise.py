@@ -77,7 +77,7 @@ def tetrahedralise(
     `edge_length_mm` holds on the surfaces of `estimate` tissues and drivers, but of those that have a longer one by
     their name in `longer_mm`; elsewhere edges are those of `SizeField`. Surface nodes lie on the level sets.
     Deterministic. `progress` is called with a sentence at each step. Raises `GeometryError` when nothing is left to
-    mesh or the remeshing fails.
+    mesh or the remeshing fails, `ResourceError` when Mmg has no memory for it.
     """
     if not 0.0 < edge_length_mm < float(anatomy.box.lengths.min()):
         raise GeometryError(
