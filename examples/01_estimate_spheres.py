@@ -28,15 +28,15 @@ frame = { label = 3, role = "driver" }
 surroundings = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }
 
 [mesh]
-edge_length_mm = 10.0
+edge_length_mm = 8.0
 [estimate]
-start_ratios = [2.0]
+start_ratios = [1.0, 4.0]
 """
 
 
 def write_case(folder: Path) -> Path:
     """Write both label images (1 mm voxels) and the case that names them."""
-    scene = spheres(SpheresOptions(seed=2, spacing_mm=(1.0, 1.0, 1.0), truth_edge_mm=6.0))
+    scene = spheres(SpheresOptions(seed=2, spacing_mm=(1.0, 1.0, 1.0), truth_edge_mm=4.0))
     write_label_image(folder / "before.nii.gz", scene.before)
     write_label_image(folder / "after.nii.gz", scene.after)
     (folder / "case.toml").write_text(CASE)
