@@ -75,10 +75,10 @@ def listed(outputs: OutputFolder) -> str:
     return f"written to {outputs.path}: {', '.join([*names, *log])}"
 
 
-def columns(rows: Sequence[Sequence[str]], *, most: int = MOST_LETTERS) -> str:
-    """Rows of cells as lines of aligned columns; of a table over `most` letters wide the widest column is broken."""
+def columns(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells as lines of aligned columns; of a table that is wider than a terminal the widest one is broken."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    beyond = sum(widths) + len(GAP) * (len(widths) - 1) - most
+    beyond = sum(widths) + len(GAP) * (len(widths) - 1) - MOST_LETTERS
     widest = widths.index(max(widths))
     if beyond > 0:
         widths[widest] = max(widths[widest] - beyond, LEAST_LETTERS)

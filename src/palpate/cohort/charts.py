@@ -19,7 +19,6 @@ MOST_IN_FOREST = 150
 COLOUR = "#0072b2"
 LINE = "#d55e00"
 OPEN = "#777777"  # what is known of a scan without a value
-NONE: Mapping[str, tuple[str, str]] = {}
 SPREAD = 0.18  # of points beside each other at a stage
 
 Patients = Sequence[Mapping[str, Any]]
@@ -27,7 +26,7 @@ Pages = Mapping[str, tuple[str, str]]
 """Address of a report of each patient, and what a link to it says."""
 
 
-def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str, pages: Pages = NONE) -> str:
+def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str, pages: Pages) -> str:
     """Quartiles of all scans of each stage, and the medians of its patients as points, with both numbers, as SVG.
 
     Where scans of a stage have no value there is no box, which would leave them out: their ends stand among the others'
@@ -76,9 +75,7 @@ def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str, pages: P
     return draw_svg(draw, size=SIZE, name=name, says=says, links=[pages[patient] for patient in links])
 
 
-def scatter_svg(
-    patients: Patients, tissue: str, unit: str, line: Mapping[str, Any], *, name: str, pages: Pages = NONE
-) -> str:
+def scatter_svg(patients: Patients, tissue: str, unit: str, line: Mapping[str, Any], *, name: str, pages: Pages) -> str:
     """Each patient's combined modulus with its 95 % interval against the stage, and the regression's line, as SVG.
 
     Arrows are ends of scans without a value. line: `regression` of statistics.json. Raises `ValueError` when nobody has
@@ -111,7 +108,7 @@ def scatter_svg(
     return draw_svg(draw, size=SIZE, name=name, says=says, links=[pages[patient] for patient in links])
 
 
-def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str, pages: Pages = NONE) -> str:
+def forest_svg(patients: Patients, tissue: str, unit: str, *, name: str, pages: Pages) -> str:
     """Each patient's combined modulus with its 95 % interval, a line each, by stage, as SVG.
 
     Arrows are ends of scans without a value. Raises `ValueError` when there are none, or too many to be drawn.

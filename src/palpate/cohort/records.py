@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from palpate.cohort.plan import CASES, Plan, document_of
-from palpate.cohort.task import Outcome, Row
+from palpate.cohort.task import Row
 from palpate.parallel import mapped
 from palpate.uncertainty import NORMAL_95
 from palpate.unknowns import KNOWN_MODULUS
@@ -67,7 +66,28 @@ class Record:
 def records_of(plan: Plan, folder: Path) -> tuple[Record, ...]:
     """A record for each row of the plan, in its order, from the files of the cohort's folder."""
     marks = plan.marks(folder)
-    return tuple(mapped(partial(_record, plan, folder, marks), range(len(marks))))
+
+    def record(number: int) -> Record:
+        """That of one row."""
+        row, mark = plan.rows[number], marks[number]
+        place = folder / CASES / row.id
+        if mark is None:
+            return Record(row, "waiting")
+        page = f"{CASES}/{row.id}/report.html" if mark.result and (place / "report.html").is_file() else ""
+        took = (mark.seconds, mark.peak_gb, page)
+        if mark.state != "done":
+            return Record(row, "failed", mark.failure_class, mark.message, (), *took)
+        document = document_of(place, mark)
+        if document is None:
+            return Record(row, "waiting")
+        moduli = tuple(_modulus(item) for item in document["estimates"] if item["parameter"] == "youngs_modulus")
+        codes = tuple(dict.fromkeys(warning["code"] for warning in document.get("warnings", ())))
+        inputs = document.get("inputs", {})
+        keys = [key for key in inputs if key not in NOT_IMAGES and f"{key}.voxels" not in inputs]
+        images = {key: inputs[key]["sha256"] for key in keys}
+        return Record(row, "done", "", mark.message, moduli, *took, codes, images)
+
+    return tuple(mapped(record, range(len(marks))))
 
 
 def tissues_of(records: Sequence[Record]) -> tuple[str, ...]:
@@ -75,57 +95,23 @@ def tissues_of(records: Sequence[Record]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(modulus.tissue for record in records for modulus in record.moduli))
 
 
-def _record(plan: Plan, folder: Path, marks: Sequence[Outcome | None], number: int) -> Record:
-    row, mark = plan.rows[number], marks[number]
-    place = folder / CASES / row.id
-    if mark is None:
-        return Record(row, "waiting")
-    page = f"{CASES}/{row.id}/report.html" if mark.result and (place / "report.html").is_file() else ""
-    took = (mark.seconds, mark.peak_gb, page)
-    if mark.state != "done":
-        return Record(row, "failed", mark.failure_class, mark.message, (), *took)
-    document = document_of(place, mark)
-    if document is None:
-        return Record(row, "waiting")
-    moduli = tuple(_modulus(item) for item in document["estimates"] if item["parameter"] == "youngs_modulus")
-    codes = tuple(dict.fromkeys(warning["code"] for warning in document.get("warnings", ())))
-    inputs = document.get("inputs", {})
-    return Record(
-        row,
-        "done",
-        "",
-        mark.message,
-        moduli,
-        *took,
-        codes,
-        {
-            key: found["sha256"]
-            for key, found in inputs.items()
-            if key not in NOT_IMAGES and f"{key}.voxels" not in inputs
-        },
-    )
-
-
 def _modulus(item: Mapping[str, Any]) -> Modulus:
     """That of an entry of `estimates`: the ratio where its scale is a range, which all scans would err by together.
 
-    Where no interval is stated, its ends are those of the profile likelihood, as far as that reaches them.
+    Where no interval is stated, its ends are those of the profile [value, signed root deviance], where that meets -1.96
+    and 1.96 by a line; None where it ends before.
     """
     stated = item.get("unit") or ("ratio" if item["value"] is None else "kPa")
     ranged = KNOWN_MODULUS in (item.get("variance_shares") or {})
     unit = "ratio" if ranged else stated
     value, ends = (item["ratio"], item["ratio_interval95"]) if unit == "ratio" else (item["value"], item["interval95"])
     reference = item["value"] / item["ratio"] if ranged and item["value"] and item["ratio"] else 1.0
-    low, high = ends or _ends_of_profile([(at / reference, root) for at, root in item.get("profile") or ()])
+    if not ends:
+        profile = [(at / reference, root) for at, root in item.get("profile") or ()]
+        centre, ends = min(profile, key=lambda point: abs(point[1]), default=(1.0, 0.0))[0], list[End]()
+        for sign in (-1.0, 1.0):
+            reached = [(at, sign * root) for at, root in profile if sign * root >= NEARLY * NORMAL_95]
+            at, root = min(reached, key=lambda point: abs(point[1] - NORMAL_95), default=(centre, 0.0))
+            ends.append(centre * math.exp(math.log(at / centre) * NORMAL_95 / root) if reached else None)
+    low, high = ends
     return Modulus(item["tissue"], unit, value, low, high, item["verdict"])
-
-
-def _ends_of_profile(profile: Sequence[Sequence[float]]) -> tuple[End, End]:
-    """Where a profile [value, signed root deviance] meets -1.96 and 1.96, by a line; None where it ends before."""
-    centre = min(profile, key=lambda point: abs(point[1]), default=(1.0, 0.0))[0]
-    ends: list[End] = []
-    for sign in (-1.0, 1.0):
-        reached = [(value, sign * root) for value, root in profile if sign * root >= NEARLY * NORMAL_95]
-        value, root = min(reached, key=lambda point: abs(point[1] - NORMAL_95), default=(centre, 0.0))
-        ends.append(centre * math.exp(math.log(value / centre) * NORMAL_95 / root) if reached else None)
-    return ends[0], ends[1]

@@ -61,14 +61,12 @@ def row_key(row: Row, overrides: Iterable[str] = ()) -> str:
     except PalpateError as error:
         said = replace(row, patient=row.id, session="", stage=None, covariates={})
         tables = [asdict(said), str(error)]
-    text = json.dumps({"case": tables, "versions": _versions()}, sort_keys=True)
+    versions = {name: found for name, found in _versions().items() if name not in NOT_NUMERICAL}
+    text = json.dumps({"case": tables, "versions": versions}, sort_keys=True)
     return hashlib.sha256(text.encode("utf-8", errors="surrogatepass")).hexdigest()
 
 
-@cache
-def _versions() -> dict[str, str]:
-    """Versions that numbers depend on; to look them up takes longer than to read a case."""
-    return {name: found for name, found in software_versions().items() if name not in NOT_NUMERICAL}
+_versions = cache(software_versions)  # to look them up takes longer than to read a case
 
 
 def _content(path: Path) -> str:

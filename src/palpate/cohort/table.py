@@ -25,6 +25,7 @@ IDENTIFIER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 STAGE = re.compile(r"[0-9]{1,4}")
 LATER = ";"  # between several later images in one cell
+OUR_OWN = ("id", "patient", "session", "names", "case")  # which participants.tsv does not tell
 IMAGES, TABLE, PARTICIPANTS = "*_dseg.nii.gz", "dseg.tsv", "participants.tsv"
 
 
@@ -160,31 +161,26 @@ def read_derivatives(folder: Path, template: Path | None, *, reference: str | No
         sessions = [path for path in _sorted(patient, "ses-*") if any(path.rglob(IMAGES))]
         rest = sessions[:1] if reference is None else [path for path in sessions if path.name == _session(reference)]
         later = [session for session in sessions if rest and session != rest[0]]
-        rows += [_row(rest[0], session, folder, template, people.get(patient.name, {})) for session in later]
+        person = people.get(patient.name, {})
+        stated = {name: text for name, text in person.items() if name not in OUR_OWN}
+        for session in later:
+            own = {"id": f"{patient.name}_{session.name}", "patient": patient.name, "session": session.name}
+            found = [sorted(path.rglob(IMAGES)) for path in (rest[0], session)]
+            images = {"before": str(found[0][0].absolute()), "after": str(found[1][0].absolute())}
+            row = row_of(stated | own | images, folder, template)
+            image = found[0][0]  # whose label table has its own name, or is dseg.tsv in its folder or one above
+            table = image.with_name(image.name.removesuffix(".nii.gz") + ".tsv")
+            above = [place / TABLE for place in image.parents if place == folder or folder in place.parents]
+            names = str(next((path.absolute() for path in (table, *above) if path.is_file()), ""))
+            several = any(len(paths) > 1 for paths in found)
+            problem = f"{rest[0].name} or {session.name} has several images {IMAGES}; leave one in each"
+            rows.append(replace(row, problem=problem) if several else replace(row, names=names))
     if not rows:
         wanted = "two sessions (sub-*/ses-*/*_dseg.nii.gz)"
         raise ConfigurationError(
             f"{folder} has no patient with {wanted}{f', one of them {_session(reference)}' if reference else ''}"
         )
     return checked_rows(rows, folder)
-
-
-def _row(rest: Path, session: Path, root: Path, template: Path, person: Mapping[str, str]) -> Row:
-    cells = {
-        **{name: text for name, text in person.items() if name not in ("id", "patient", "session", "names", "case")},
-        "id": f"{session.parent.name}_{session.name}",
-        "patient": session.parent.name,
-        "session": session.name,
-    }
-    found = [sorted(path.rglob(IMAGES)) for path in (rest, session)]
-    images = {"before": str(found[0][0].absolute()), "after": str(found[1][0].absolute())}
-    row = row_of(cells | images, root, template)
-    if any(len(paths) > 1 for paths in found):
-        return replace(row, problem=f"{rest.name} or {session.name} has several images {IMAGES}; leave one in each")
-    image = found[0][0]  # whose label table has its own name, or is dseg.tsv in its folder or one above
-    own = image.with_name(image.name.removesuffix(".nii.gz") + ".tsv")
-    above = [folder / TABLE for folder in image.parents if folder == root or root in folder.parents]
-    return replace(row, names=str(next((path.absolute() for path in (own, *above) if path.is_file()), "")))
 
 
 def _sorted(folder: Path, pattern: str) -> list[Path]:

@@ -15,7 +15,6 @@ from palpate.export.conditions import prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.groups import (
     OFF,
-    MaterialPart,
     element_faces,
     face_groups,
     material_parts,
@@ -72,23 +71,19 @@ def _text(model: FittedModel, body: FittedBody, space: LagrangeSpace, element: s
         name = names[part.name]
         if part.name not in tissues:
             parts += [f"*ELSET, ELSET={name}\n", wrapped(part.cells + 1)]
-        parts += [f"*MATERIAL, NAME={name}\n", _material(model, body, part)]
+        # the law with its constants in kPa, D1 in 1/kPa
+        modulus = float(model.moduli[part.tissue] * np.exp(part.log_ratio))
+        ratio, law = body.tissues[part.tissue].poisson_ratio, model.law_among(*LAWS)
+        shear, compliance = modulus / (2.0 * (1.0 + ratio)), 6.0 * (1.0 - 2.0 * ratio) / modulus
+        stated = f"*HYPERELASTIC, NEO HOOKE\n{0.5 * shear:.12g}, {compliance:.12g}\n"
+        if isinstance(law, Linear):
+            stated = f"*ELASTIC\n{modulus:.12g}, {ratio:.12g}\n"
+        elif isinstance(law, MooneyRivlin):
+            constants = ", ".join(f"{c:.12g}" for c in (*(c * shear for c in law.coefficients), compliance))
+            stated = f"*HYPERELASTIC, MOONEY-RIVLIN\n{constants}\n"
+        parts += [f"*MATERIAL, NAME={name}\n", stated]
         parts += [f"*SOLID SECTION, ELSET={name}, MATERIAL={name}\n"]
     return "".join([*parts, *_steps(model, body, space)])
-
-
-def _material(model: FittedModel, body: FittedBody, part: MaterialPart) -> str:
-    """The law of a part of a tissue with its constants in kPa, D1 in 1/kPa."""
-    modulus = float(model.moduli[part.tissue] * np.exp(part.log_ratio))
-    ratio, law = body.tissues[part.tissue].poisson_ratio, model.law_among(*LAWS)
-    if isinstance(law, Linear):
-        return f"*ELASTIC\n{modulus:.12g}, {ratio:.12g}\n"
-    shear, compliance = modulus / (2.0 * (1.0 + ratio)), 6.0 * (1.0 - 2.0 * ratio) / modulus
-    if isinstance(law, MooneyRivlin):
-        first, second = law.coefficients
-        constants = f"{first * shear:.12g}, {second * shear:.12g}, {compliance:.12g}"
-        return f"*HYPERELASTIC, MOONEY-RIVLIN\n{constants}\n"
-    return f"*HYPERELASTIC, NEO HOOKE\n{0.5 * shear:.12g}, {compliance:.12g}\n"
 
 
 def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[str]:

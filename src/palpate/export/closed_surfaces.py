@@ -5,7 +5,7 @@ A file a tissue and state. Their headings tell 3D Slicer that the coordinates ar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from palpate.export.case_files import file_name
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.formats import Write
 from palpate.export.groups import rows
 from palpate.images.tissue import Role
 from palpate.mesh.surface import tissue_surface, triangle_normals
@@ -71,45 +70,41 @@ def closed_surfaces(body: FittedBody) -> Iterator[ClosedSurface]:
             yield ClosedSurface(stem, tissue.name, state, own, closed)
 
 
-def _obj(surface: ClosedSurface) -> bytes:
-    """Wavefront's text: points, then triangles that count them from 1; the tissue's name is its object's."""
-    heading = f"# {HEADING.decode()}\no {surface.name}\n"
-    text = heading + rows("v %.9g %.9g %.9g", surface.points) + rows("f %d %d %d", surface.triangles + 1)
-    return text.encode()
+def write_obj(model: FittedModel, body: FittedBody, folder: Path) -> None:
+    """Write Wavefront's text: points, then triangles that count them from 1; the tissue's name is its object's."""
+    del model
+    for surface in closed_surfaces(body):
+        heading = f"# {HEADING.decode()}\no {surface.name}\n"
+        text = heading + rows("v %.9g %.9g %.9g", surface.points) + rows("f %d %d %d", surface.triangles + 1)
+        write_bytes(folder / f"{surface.stem}.obj", text.encode())
 
 
-def _ply(surface: ClosedSurface) -> bytes:
-    """Binary little-endian, double precision: a heading that describes the rows of numbers after it."""
-    heading = (
-        f"ply\nformat binary_little_endian 1.0\ncomment {HEADING.decode()}\n"
-        f"element vertex {len(surface.points)}\nproperty double x\nproperty double y\nproperty double z\n"
-        f"element face {len(surface.triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    faces = np.zeros(len(surface.triangles), dtype=FACE)
-    faces["count"], faces["corners"] = 3, surface.triangles
-    return heading.encode() + surface.points.astype("<f8").tobytes() + faces.tobytes()
+def write_ply(model: FittedModel, body: FittedBody, folder: Path) -> None:
+    """Write binary little-endian, double precision: a heading that describes the rows of numbers after it."""
+    del model
+    for surface in closed_surfaces(body):
+        heading = (
+            f"ply\nformat binary_little_endian 1.0\ncomment {HEADING.decode()}\n"
+            f"element vertex {len(surface.points)}\nproperty double x\nproperty double y\nproperty double z\n"
+            f"element face {len(surface.triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+        )
+        faces = np.zeros(len(surface.triangles), dtype=FACE)
+        faces["count"], faces["corners"] = 3, surface.triangles
+        content = heading.encode() + surface.points.astype("<f8").tobytes() + faces.tobytes()
+        write_bytes(folder / f"{surface.stem}.ply", content)
 
 
-def _stl(surface: ClosedSurface) -> bytes:
-    """Binary: 80 bytes of heading, the number of facets, and each with its normal."""
-    facets = np.zeros(len(surface.triangles), dtype=FACET)
-    normals = triangle_normals(surface.points, surface.triangles)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    facets["normal"] = normals / np.maximum(lengths, np.finfo(float).tiny)
-    facets["corners"] = surface.points[surface.triangles]
-    return HEADING.ljust(80) + np.uint32(len(facets)).tobytes() + facets.tobytes()
-
-
-def _writer(ending: str, content: Callable[[ClosedSurface], bytes]) -> Write:
-    """Writes NN_tissue_before and NN_tissue_after, each closed surface in a file of its own."""
-
-    def write(model: FittedModel, body: FittedBody, folder: Path, *_: Path | None) -> None:
-        """Write them; raises `ResourceError` when the disk refuses."""
-        del model
-        for surface in closed_surfaces(body):
-            write_bytes(folder / f"{surface.stem}.{ending}", content(surface))
-
-    return write
+def write_stl(model: FittedModel, body: FittedBody, folder: Path) -> None:
+    """Write binary: 80 bytes of heading, the number of facets, and each with its normal."""
+    del model
+    for surface in closed_surfaces(body):
+        facets = np.zeros(len(surface.triangles), dtype=FACET)
+        normals = triangle_normals(surface.points, surface.triangles)
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        facets["normal"] = normals / np.maximum(lengths, np.finfo(float).tiny)
+        facets["corners"] = surface.points[surface.triangles]
+        content = HEADING.ljust(80) + np.uint32(len(facets)).tobytes() + facets.tobytes()
+        write_bytes(folder / f"{surface.stem}.stl", content)
 
 
 def _rims(triangles: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -132,6 +127,3 @@ def _rims(triangles: NDArray[np.int64]) -> list[NDArray[np.int64]]:
             point = point_after
         rims.append(np.array(rim))
     return rims
-
-
-write_obj, write_ply, write_stl = _writer("obj", _obj), _writer("ply", _ply), _writer("stl", _stl)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.groups import element_faces, face_groups, rows, tissue_groups
-from palpate.mesh.space import LagrangeSpace
 from palpate.study.outputs import write_text
 
 TETRAHEDRON, TRIANGLE = {1: 4, 2: 11}, {1: 2, 2: 9}  # gmsh's element types by order
@@ -40,7 +39,17 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
         rows("%d", np.arange(1, n + 1)),
         rows("%.16g %.16g %.16g", space.points),
     ]
-    parts += ["$EndNodes\n", *_elements(space, surfaces, volumes)]
+    # triangles, then tetrahedra, numbered as they come
+    order = EDGES[: space.cells.shape[1]]
+    blocks = [(2, tag, TRIANGLE, space.facets(faces)) for tag, (_, faces) in enumerate(surfaces, start=1)]
+    blocks += [(3, tag, TETRAHEDRON, space.cells[c][:, order]) for tag, c in enumerate(volumes.values(), start=1)]
+    total, first = sum(len(nodes) for *_, nodes in blocks), 1
+    parts.append(f"$EndNodes\n$Elements\n{len(blocks)} {total} 1 {total}\n")
+    for dimension, tag, kind, nodes in blocks:
+        parts.append(f"{dimension} {tag} {kind[space.order]} {len(nodes)}\n")
+        parts.append(rows(" ".join(["%d"] * (1 + nodes.shape[1])), np.arange(first, first + len(nodes)), nodes + 1))
+        first += len(nodes)
+    parts.append("$EndElements\n")
     for number, displacement in enumerate(body.displacements, start=1):
         heading = f'$NodeData\n1\n"displacement_mm"\n1\n{float(number):g}\n3\n{number}\n3\n{n}\n'
         parts += [heading, rows("%d %.9g %.9g %.9g", np.arange(1, n + 1), displacement), "$EndNodeData\n"]
@@ -74,25 +83,6 @@ def _surfaces(body: FittedBody) -> tuple[list[tuple[tuple[int, ...], NDArray[np.
         for number, row in enumerate(kinds)
     ]
     return found, [group.name for group in groups]
-
-
-def _elements(
-    space: LagrangeSpace,
-    surfaces: list[tuple[tuple[int, ...], NDArray[np.int64]]],
-    volumes: dict[str, NDArray[np.int64]],
-) -> list[str]:
-    """Triangles, then tetrahedra, numbered as they come."""
-    order = EDGES[: space.cells.shape[1]]
-    blocks = [(2, tag, TRIANGLE, space.facets(faces)) for tag, (_, faces) in enumerate(surfaces, start=1)]
-    blocks += [(3, tag, TETRAHEDRON, space.cells[c][:, order]) for tag, c in enumerate(volumes.values(), start=1)]
-    total, first = sum(len(nodes) for *_, nodes in blocks), 1
-    parts = [f"$Elements\n{len(blocks)} {total} 1 {total}\n"]
-    for dimension, tag, kind, nodes in blocks:
-        numbers = np.arange(first, first + len(nodes))
-        first += len(nodes)
-        pattern = " ".join(["%d"] * (1 + nodes.shape[1]))
-        parts += [f"{dimension} {tag} {kind[space.order]} {len(nodes)}\n", rows(pattern, numbers, nodes + 1)]
-    return [*parts, "$EndElements\n"]
 
 
 def _box(points: NDArray[np.float64]) -> str:

@@ -17,6 +17,7 @@ from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
 from palpate.study.outputs import write_text
 
 STEP = 0.05  # of ln E, between the materials of a tissue that is not homogeneous
+MOST_LETTERS = 80  # of a plain name
 OFF = float(np.expm1(0.5 * STEP))  # of a modulus, that an element has less or more than its material, at the most
 
 
@@ -33,11 +34,10 @@ def write_script(path: Path) -> None:
     write_text(path, script.read_text(encoding="utf-8"))
 
 
-def wrapped(numbers: NDArray[np.int64], *, width: int = 12) -> str:
-    """Numbers (n,) with commas between them, `width` on a line."""
-    return "".join(
-        ", ".join(map(str, numbers[start : start + width].tolist())) + "\n" for start in range(0, len(numbers), width)
-    )
+def wrapped(numbers: NDArray[np.int64]) -> str:
+    """Numbers (n,) with commas between them, twelve on a line."""
+    lines = [numbers[start : start + 12].tolist() for start in range(0, len(numbers), 12)]
+    return "".join(f"{', '.join(map(str, line))}\n" for line in lines)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,12 +112,12 @@ def element_faces(mesh: TetMesh, triangles: NDArray[np.int64]) -> tuple[NDArray[
     return place // 4, place % 4
 
 
-def plain_names(names: Iterable[str], *, most: int = 80) -> dict[str, str]:
+def plain_names(names: Iterable[str]) -> dict[str, str]:
     """Names of capital letters, digits and underscores, each its own, for programs that take no others."""
     found: dict[str, str] = {}
     for name in names:
         letters = "".join(c.upper() if c.isascii() and c.isalnum() else "_" for c in name)
-        plain = (letters if letters[:1].isalpha() else f"T_{letters}")[: most - 6]
+        plain = (letters if letters[:1].isalpha() else f"T_{letters}")[: MOST_LETTERS - 6]
         taken, number = set(found.values()), 2
         unique = plain
         while unique in taken:

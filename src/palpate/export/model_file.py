@@ -46,7 +46,17 @@ def read_model(folder: Path) -> FittedModel:
             " again with this version"
         )
     for name, entry in files.items():
-        _refuse_other(folder, name, entry["sha256"])
+        own = folder / name
+        if Path(name).name != name or own.is_symlink() or not own.is_file():
+            raise InputDataError(
+                f"{folder} is incomplete: the file '{printable(name)}', which its {RESULT} lists, is not there; run the"
+                " estimate again"
+            )
+        if sha256_of(own) != entry["sha256"]:
+            raise InputDataError(
+                f"{own} was changed after the estimate that {RESULT} tells of (its SHA-256 is another); run the"
+                " estimate again, into another folder"
+            )
     model = read_archive(FittedModel, folder / MODEL, version=FORMAT, sha256=files[MODEL]["sha256"])
     if model.seal != seal_of(document):
         raise InputDataError(
@@ -59,18 +69,3 @@ def read_model(folder: Path) -> FittedModel:
                 f"{folder / MODEL} holds displacements of other points than its mesh has; run the estimate again"
             )
     return model
-
-
-def _refuse_other(folder: Path, name: str, sha256: str) -> None:
-    """Raise `InputDataError` where the file `name` of the run is missing or has other bytes."""
-    path = folder / name
-    if Path(name).name != name or path.is_symlink() or not path.is_file():
-        raise InputDataError(
-            f"{folder} is incomplete: the file '{printable(name)}', which its {RESULT} lists, is not there; run the"
-            " estimate again"
-        )
-    if sha256_of(path) != sha256:
-        raise InputDataError(
-            f"{path} was changed after the estimate that {RESULT} tells of (its SHA-256 is another); run the estimate"
-            " again, into another folder"
-        )

@@ -14,7 +14,7 @@ import numpy as np
 from palpate.errors import ConfigurationError
 from palpate.export.conditions import prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.export.groups import MaterialPart, face_groups, material_parts, plain_names, write_script
+from palpate.export.groups import face_groups, material_parts, plain_names, write_script
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
@@ -60,31 +60,29 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     groups = {f"group_{number}": np.unique(group.triangles) for number, group in enumerate(face_groups(mesh))}
     memory = io.BytesIO()
     np.savez_compressed(memory, allow_pickle=False, **arrays, **groups)
-    names = plain_names(of.name for of in parts)
+    names, law = plain_names(of.name for of in parts), model.law_among(Linear, NeoHookean, MooneyRivlin)
+    tissues = list[dict[str, object]]()  # the force field of each part with its parameters, moduli in kPa
+    for number, of in enumerate(parts):
+        modulus, ratio = float(model.moduli[of.tissue] * np.exp(of.log_ratio)), body.tissues[of.tissue].poisson_ratio
+        shear, bulk = modulus / (2.0 * (1.0 + ratio)), modulus / (3.0 * (1.0 - 2.0 * ratio))
+        lame = 2.0 * shear * ratio / (1.0 - 2.0 * ratio)
+        parameters: dict[str, object] = {"materialName": "NeoHookean", "ParameterSet": f"{shear:.12g} {lame:.12g}"}
+        field = "TetrahedronHyperelasticityFEMForceField"
+        if not law.finite:
+            field = "TetrahedronFEMForceField"
+            parameters = {"method": "small", "youngModulus": modulus, "poissonRatio": ratio}
+        elif isinstance(law, MooneyRivlin):
+            first, second = (shear * coefficient for coefficient in law.coefficients)
+            parameters = {"materialName": "MooneyRivlin", "ParameterSet": f"{first:.12g} {second:.12g} {bulk:.12g}"}
+        what = {"name": of.name, "id": names[of.name], "part": number, "force_field": field}
+        tissues.append(what | {"parameters": parameters})
     document = {
         "schema": "palpate.sofa/1",
         "units": model.units,
         "plugins": list(PLUGINS),
-        "tissues": [_tissue(model, body, number, of, names[of.name]) for number, of in enumerate(parts)],
+        "tissues": tissues,
         "groups": {f"group_{number}": group.name for number, group in enumerate(face_groups(mesh))},
     }
     write_bytes(folder / "model.npz", memory.getvalue())
     write_json(folder / "model.json", document)
     write_script(folder / "scene.py")
-
-
-def _tissue(model: FittedModel, body: FittedBody, number: int, part: MaterialPart, plain: str) -> dict[str, object]:
-    """The force field of a part of a tissue with its parameters, moduli in kPa."""
-    tissue, modulus = body.tissues[part.tissue], float(model.moduli[part.tissue] * np.exp(part.log_ratio))
-    ratio, law = tissue.poisson_ratio, model.law_among(Linear, NeoHookean, MooneyRivlin)
-    shear = modulus / (2.0 * (1.0 + ratio))
-    lame, bulk = 2.0 * shear * ratio / (1.0 - 2.0 * ratio), modulus / (3.0 * (1.0 - 2.0 * ratio))
-    parameters: dict[str, object] = {"materialName": "NeoHookean", "ParameterSet": f"{shear:.12g} {lame:.12g}"}
-    force_field = "TetrahedronHyperelasticityFEMForceField"
-    if not law.finite:
-        force_field = "TetrahedronFEMForceField"
-        parameters = {"method": "small", "youngModulus": modulus, "poissonRatio": ratio}
-    elif isinstance(law, MooneyRivlin):
-        first, second = (shear * coefficient for coefficient in law.coefficients)
-        parameters = {"materialName": "MooneyRivlin", "ParameterSet": f"{first:.12g} {second:.12g} {bulk:.12g}"}
-    return {"name": part.name, "id": plain, "part": number, "force_field": force_field, "parameters": parameters}

@@ -59,10 +59,20 @@ def methods_text(data: ReportData) -> Methods:
     allowed = listed([CAUSES[cause] for cause in UNKNOWNS if cause in counted])
     given = listed(["the material law", *(words for cause, words in GIVEN.items() if cause not in counted)])
     covered = (f" They allow for {allowed}." if allowed else "") + f" They do not cover the errors of {given}."
+    law = _law(data)
+    onwards = " The linear law gave the start; the fit then went on over expansions around finite-strain equilibria."
+    observed = listed(list(data.document.get("observations", {}).values())) or "what the case's observations compare"
     paragraphs = (
         _aim(data, cite),
         _model(data, cite),
-        _fit(data, cite),
+        (
+            f"The misfit was {observed}. Outliers counted less: by densities with the tails of a power law, on the"
+            f" drivers' walls by Huber's loss {cite('huber')}. Minus the log posterior of the logarithms of the moduli,"
+            " of all other unknowns, of the noise and of the priors' amplitudes was minimised from"
+            f" {len(data.document['starts'])} starts by Gauss-Newton steps in a trust region {cite('nocedal')}, on a"
+            f" reduced basis whose error was bounded at the estimate {cite('reduced')}."
+            f"{onwards if law is not None and law.finite else ''}"
+        ),
         (
             "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated"
             f" residuals {cite('white')}, with the scatter over the voxel grid's position and a term for the mesh"
@@ -144,18 +154,3 @@ def _law(data: ReportData) -> Law | None:
     settings = dict(data.settings)
     stated = {name: float(settings[name]) for name in law_parameters() if name in settings}
     return law_from(data.document["law"], stated) if data.document["law"] in LAWS else None
-
-
-def _fit(data: ReportData, cite: _Citations) -> str:
-    starts = len(data.document["starts"])
-    law = _law(data)
-    finite = law is not None and law.finite
-    onwards = " The linear law gave the start; the fit then went on over expansions around finite-strain equilibria."
-    observed = listed(list(data.document.get("observations", {}).values())) or "what the case's observations compare"
-    return (
-        f"The misfit was {observed}. Outliers counted less: by densities with the tails of a power law, on the drivers'"
-        f" walls by Huber's loss {cite('huber')}. Minus the log posterior of the logarithms of the moduli, of all other"
-        f" unknowns, of the noise and of the priors' amplitudes was minimised from {starts} starts by Gauss-Newton"
-        f" steps in a trust region {cite('nocedal')}, on a reduced basis whose error was bounded at the estimate"
-        f" {cite('reduced')}.{onwards if finite else ''}"
-    )

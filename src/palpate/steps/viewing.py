@@ -74,21 +74,11 @@ def viewing(folder: Path) -> Viewing:
     document = read_json(folder / RESULT)
     files = {name: entry["sha256"] for name, entry in document.get("files", {}).items() if is_inside(folder, name)}
     word = secrets.token_urlsafe(16)
-    try:
-        server = ThreadingHTTPServer((LOOPBACK, 0), _handler(folder, str(document.get("id", "")), files, word))
-    except OSError as error:
-        raise ResourceError(f"no port of {LOOPBACK} can be opened: {error.strerror or error}") from error
-    server.daemon_threads = True
-    return Viewing(server, word)
-
-
-def _handler(folder: Path, title: str, files: Mapping[str, str], word: str) -> type[BaseHTTPRequestHandler]:
-    """What answers: GET of the list and of the files that the result names, to this host alone."""
     items = "".join(f'<li><a href="{quote(name)}">{html.escape(name)}</a></li>' for name in [RESULT, *sorted(files)])
-    page = PAGE.format(title=html.escape(title), items=items).encode()
+    page = PAGE.format(title=html.escape(str(document.get("id", ""))), items=items).encode()
 
     class Handler(BaseHTTPRequestHandler):
-        """One request."""
+        """What answers: GET of the list and of the files that the result names, to this host alone."""
 
         server_version, sys_version = "Palpate", ""
 
@@ -117,7 +107,12 @@ def _handler(folder: Path, title: str, files: Mapping[str, str], word: str) -> t
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the base class's name
             """Say nothing: a browser's requests are of no interest."""
 
-    return Handler
+    try:
+        server = ThreadingHTTPServer((LOOPBACK, 0), Handler)
+    except OSError as error:
+        raise ResourceError(f"no port of {LOOPBACK} can be opened: {error.strerror or error}") from error
+    server.daemon_threads = True
+    return Viewing(server, word)
 
 
 def _content(folder: Path, name: str, files: Mapping[str, str]) -> bytes | None:

@@ -54,8 +54,29 @@ def folder_lock(folder: Path) -> Iterator[bool]:
     if sys.platform == "win32":  # no POSIX locks: two runs in a folder are not noticed there
         yield False
         return
-    path = folder / NAME
-    file, locked = _locked(path)
+    path, same = folder / NAME, False
+    while not same:  # a file that its last owner has removed meanwhile is left alone
+        file, locked = own_file(path), True
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno != errno.EWOULDBLOCK:
+                locked = False
+                break
+            owner = os.pread(file, 20, 0).decode("ascii", errors="replace").strip()
+            os.close(file)
+            raise FolderInUse(
+                f"another run of palpate{f' (process {owner})' if owner.isdigit() else ''} works in {path.parent}: wait"
+                " until it has ended, or choose another --output folder"
+            ) from error
+        with suppress(OSError):
+            same = path.stat().st_ino == os.fstat(file).st_ino
+        if not same:
+            os.close(file)
+    if locked:
+        with suppress(OSError):  # who holds the lock is a courtesy; a full disk must not cost the run here
+            os.ftruncate(file, 0)
+            os.write(file, str(os.getpid()).encode())
     try:
         yield locked
     finally:
@@ -100,33 +121,6 @@ def own_file(path: Path) -> int:
         os.close(file)
         raise _refused(path, NO_FILE)
     return file
-
-
-def _locked(path: Path) -> tuple[int, bool]:
-    """The lock's file, and whether it is held; one that its last owner has removed meanwhile is left alone."""
-    while True:
-        file = own_file(path)
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno != errno.EWOULDBLOCK:
-                return file, False
-            owner = os.pread(file, 20, 0).decode("ascii", errors="replace").strip()
-            os.close(file)
-            raise FolderInUse(
-                f"another run of palpate{f' (process {owner})' if owner.isdigit() else ''} works in {path.parent}: wait"
-                " until it has ended, or choose another --output folder"
-            ) from error
-        try:
-            same = path.stat().st_ino == os.fstat(file).st_ino
-        except OSError:
-            same = False
-        if same:
-            with suppress(OSError):  # who holds the lock is a courtesy; a full disk must not cost the run here
-                os.ftruncate(file, 0)
-                os.write(file, str(os.getpid()).encode())
-            return file, True
-        os.close(file)
 
 
 def _refused(path: Path, why: str) -> ResourceError:

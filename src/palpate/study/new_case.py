@@ -144,12 +144,15 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
     elif background is not None:
         notes.append(background.in_words)
     from_ct = background is not None and background.has_air
-    named_by = _identifier([images.before, *images.after])
+    # called by what the images' names begin with alike; else by their folder's
+    letters = zip(*(path.name.split(".")[0] for path in (images.before, *images.after)), strict=False)
+    alike = "".join(same[0] for same in takewhile(lambda same: len(set(same)) == 1, letters)).strip("-_ ")
+    called = alike if len(alike) >= LEAST_NAME else images.before.absolute().parent.name or alike
     heading = ["# Made by `palpate init`. Every role is a guess: read the reasons, correct what is wrong."]
     heading += [f"# {line}" for line in ROLES]
     heading += [_comment(f"QUESTION: {question}") for question in questions]
     heading += [_comment(f"NOTE: {note}") for note in notes]
-    heading.append(f"id = {toml_text(named_by)}")
+    heading.append(f"id = {toml_text(printable(called)[:MAX_NAME] or 'case')}")
     blocks = ["\n".join(heading), _images(images, folder, from_ct=from_ct)]
     share = float(np.prod([s.stop - s.start for s in window]) / before.labels.size)
     if share < 1.0:
@@ -159,15 +162,6 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
         blocks.append(f"[mesh]\nedge_length_mm = {proposed[0]:g}  # {proposed[1]}")
     blocks += [_tissue(tissue, before) for tissue in tissues]
     return NewCase(folder / CASE_NAME, "\n\n".join(blocks) + "\n", tissues, questions)
-
-
-def _identifier(images: Sequence[Path]) -> str:
-    """What the images' names begin with alike; else the name of their folder."""
-    letters = zip(*(path.name.split(".")[0] for path in images), strict=False)
-    alike = "".join(same[0] for same in takewhile(lambda same: len(set(same)) == 1, letters)).strip("-_ ")
-    folder = images[0].absolute().parent.name
-    found = alike if len(alike) >= LEAST_NAME else folder or alike
-    return printable(found)[:MAX_NAME] or "case"
 
 
 def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:

@@ -60,7 +60,20 @@ def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simu
         body = make_body(states, case, progress=progress)
         space, summary = body.space, MeshSummary.of(body.quality, body.space, body.edge_length)
         progress("solving for the displacement")
-        displacements = _steps(body, case, steps, progress)
+        shares = [step / steps for step in range(1, steps + 1)]
+        if case.motion is None and states.after:
+            problem = inverse_problem(body, case, progress=progress)
+            given, model = _moduli(problem.states[0].model.space.mesh.tissues), problem.states[0].finite_strain
+            if model is not None and case.strained_reference:
+                borne = case_loads(case, space, 0)
+                strained = unloaded_displacement(model, given, np.zeros(model.material.n_modes), borne)
+                problem = inverse_problem(strained_body(body, strained, case), case, progress=progress)
+            displacements = fit_driver(problem, given, shares=shares)[-1]
+        elif case.mechanics.material_law.finite:
+            displacements = tuple(_moved(body, case, share) for share in shares)
+        else:
+            whole = _moved(body, case, 1.0)
+            displacements = tuple(whole * share for share in shares)
         last = displacements[-1]
         before, after = (_labels(states.before, space, motion) for motion in (np.zeros_like(last), last))
         remarks = (*states.findings, *body.findings)
@@ -110,24 +123,6 @@ def filled(
         space, constraint, _moduli(tissues), law=law, dilatation=dilatation, loads=loads, strained=strained
     )
     return found.displacement
-
-
-def _steps(body: Body, case: Case, steps: int, progress: Progress) -> tuple[NDArray[np.float64], ...]:
-    """Displacements (n_points, 3) mm at equal shares of the motion, each in equilibrium, the last one the whole."""
-    shares = [step / steps for step in range(1, steps + 1)]
-    if case.motion is None and body.states.after:
-        problem = inverse_problem(body, case, progress=progress)
-        moduli = _moduli(problem.states[0].model.space.mesh.tissues)
-        model = problem.states[0].finite_strain
-        if model is not None and case.strained_reference:
-            given = np.zeros(model.material.n_modes)
-            strained = unloaded_displacement(model, moduli, given, case_loads(case, body.space, 0))
-            problem = inverse_problem(strained_body(body, strained, case), case, progress=progress)
-        return fit_driver(problem, moduli, shares=shares)[-1]
-    if not case.mechanics.material_law.finite:
-        whole = _moved(body, case, 1.0)
-        return tuple(whole * share for share in shares)
-    return tuple(_moved(body, case, share) for share in shares)
 
 
 def _moved(body: Body, case: Case, share: float) -> NDArray[np.float64]:

@@ -208,7 +208,15 @@ def sobol_result(
     mapping = inversion.objective.parameters
     of = _inputs(inversion, _equilibria(inversion), tissues, dilatation, voxel_mm)
     inputs = [each for each in of if each.subject != ALL]
-    ranges = [*(each.range for each in inputs), *_ranges(inversion, tissues)]
+    ranges = [each.range for each in inputs]
+    # what changes no residual: a known modulus that alone sets the scale, and the drivers' prior
+    if _exact(inversion, tissues):
+        (known,) = {tissue.name for tissue in tissues if tissue.role is Role.KNOWN}
+        scale = float(np.log(KNOWN_FACTOR))
+        ranges.append(Range("known_modulus", known, -scale, scale, "ln E"))
+    if mapping.n_coefficients:
+        low, high = np.log2(PRIOR_WIDTHS).tolist()
+        ranges.append(Range("driver_prior", "", low, high, "log2 of the width"))
     causes = [each.cause for each in ranges[len(inputs) :]]
 
     def one(sample: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -240,19 +248,6 @@ def sobol_result(
         by_tissue(found.total_half),
         found.failed,
     )
-
-
-def _ranges(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Range]:
-    """Those of what changes no residual: a known modulus that alone sets the scale, and the drivers' prior."""
-    found = []
-    if _exact(inversion, tissues):
-        (known,) = {tissue.name for tissue in tissues if tissue.role is Role.KNOWN}
-        scale = float(np.log(KNOWN_FACTOR))
-        found.append(Range("known_modulus", known, -scale, scale, "ln E"))
-    if inversion.objective.parameters.n_coefficients:
-        low, high = np.log2(PRIOR_WIDTHS).tolist()
-        found.append(Range("driver_prior", "", low, high, "log2 of the width"))
-    return found
 
 
 def _equilibria(inversion: Inversion) -> Equilibria:

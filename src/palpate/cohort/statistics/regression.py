@@ -50,8 +50,14 @@ def stage_regression(
         means = np.array([np.mean(numbers) for numbers in found_of])
         if np.isfinite(means).all() and len(means) and np.ptp(means) > 0.0:
             beside[name] = means
-    if words := _undefined(kept, x, 2 + len(beside)):
-        return {"undefined": words}
+    values, needed = {scan.value for scan in kept if scan.value is not None}, max(FEWEST, 3 + len(beside))
+    words = "" if len(values) >= FEWEST else f"{len(values)} different values, and {FEWEST} are needed"
+    if len(x) < needed:
+        words = f"{len(x)} patients with a stage and a modulus, and {needed} are needed"
+    elif len(np.unique(x)) < 2:
+        words = f"all patients have the stage {x[0]:g}, and a regression needs two"
+    if words:
+        return {"undefined": f"undefined: {words}"}
     regression = _Regression(_Data.of(kept, one), x - x.mean(), np.array([np.ones(len(x)), *beside.values()]).T, seed)
     slope, fitted = regression.slope()
     found: dict[str, Any] = {
@@ -233,15 +239,3 @@ class _Regression:
         return np.asarray(
             optimize.minimize(negative, start if near is None else near, bounds=bounds, method="L-BFGS-B").x
         )
-
-
-def _undefined(scans: Sequence[Scan], x: Array, coefficients: int) -> str:
-    """Why there is no regression, in words; empty where there is one."""
-    if len(x) < max(FEWEST, coefficients + 1):
-        return (
-            f"undefined: {len(x)} patients with a stage and a modulus, and {max(FEWEST, coefficients + 1)} are needed"
-        )
-    if len(np.unique(x)) < 2:
-        return f"undefined: all patients have the stage {x[0]:g}, and a regression needs two"
-    values = {scan.value for scan in scans if scan.value is not None}
-    return "" if len(values) >= FEWEST else f"undefined: {len(values)} different values, and {FEWEST} are needed"
