@@ -123,7 +123,6 @@ def make_parser() -> argparse.ArgumentParser:
     demo.set_defaults(targets=written.TARGETS)
     _add_preparations(subparsers)
     _add_estimates(subparsers)
-    _add_results(subparsers)
     _add_cohort(subparsers)
     try:
         for add in brought("palpate.commands", FunctionType, taken=EXAMPLES).values():
@@ -176,7 +175,7 @@ def _add_preparations(subparsers: Any) -> None:
 
 
 def _add_estimates(subparsers: Any) -> None:
-    """What finds moduli: estimate, sensitivity."""
+    """What finds moduli and hands them on: estimate, sensitivity, report, export, view."""
     what = "find the Young's modulus of each organ of a case, or of label images before and after"
     estimate = _command(subparsers, "estimate", written.estimate, what=what)
     estimate.add_argument(
@@ -200,15 +199,6 @@ def _add_estimates(subparsers: Any) -> None:
     what = "also Sobol indices of N samples an input, a power of 2 (extra `sensitivity`)"
     sensitivity.add_argument("--sobol", type=_power_of_two, default=0, metavar="N", help=what)
     sensitivity.set_defaults(targets=written.SENSITIVITY_TARGETS)
-
-
-def _add_ct(command: argparse.ArgumentParser) -> None:
-    what = "CT of before, or of each image: for the report, and to tell air from tissue in label 0"
-    command.add_argument("--ct", type=Path, nargs="+", default=[], metavar="CT", help=what)
-
-
-def _add_results(subparsers: Any) -> None:
-    """What hands on a result: report, export, view."""
     what = "draw report.html of an estimate again"
     report = _command(subparsers, "report", written.report, what=what, folder=None)
     report.add_argument("output", type=Path, metavar="DIR", help="the output folder of an estimate")
@@ -258,6 +248,11 @@ def _add_cohort(subparsers: Any) -> None:
     statistics = _command(subparsers, "statistics", cohorts.statistics, what=what, folder=None)
     statistics.add_argument("output", type=Path, metavar="DIR", help="the output folder of a cohort")
     statistics.set_defaults(makes_folder=False, targets=cohorts.TARGETS)
+
+
+def _add_ct(command: argparse.ArgumentParser) -> None:
+    what = "CT of before, or of each image: for the report, and to tell air from tissue in label 0"
+    command.add_argument("--ct", type=Path, nargs="+", default=[], metavar="CT", help=what)
 
 
 def _add_case(command: argparse.ArgumentParser) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -19,15 +18,6 @@ POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri
 MOST_ROWS = 2000  # of the table; cohort.csv has all
 
 
-@dataclass(frozen=True, slots=True)
-class _Chart:
-    """A chart of a tissue, or the reason why there is none."""
-
-    title: str
-    body: Markup | None
-    missing: str = ""
-
-
 def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, created: str, version: str) -> str:
     """The page of a cohort: one file that loads nothing, every name in it escaped.
 
@@ -39,7 +29,7 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
         if record.page:
             says = f"report of {record.row.id}, patient {record.row.patient}"
             pages.setdefault(record.row.patient, (record.page, says))
-    patients, charts = document["patients"], dict[str, list[_Chart]]()
+    patients, charts = document["patients"], dict[str, list[dict[str, Any]]]()
     for place, (tissue, organ) in enumerate(document["organs"].items()):
         drawings = {
             "Scans by stage, patients as points": partial(boxes_svg, patients, tissue, organ["unit"]),
@@ -48,15 +38,16 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
         }
         charts[tissue] = []
         for i, (title, draw) in enumerate(drawings.items()):
+            body, missing = None, ""
             try:
                 svg = draw(name=f"c{place}-{i}", pages=pages)
-                chart = _Chart(title, Markup(svg))  # noqa: S704 - drawn by us, names in it as paths
+                body = Markup(svg)  # noqa: S704 - drawn by us, names in it as paths
             except ValueError as error:
-                chart = _Chart(title, None, str(error))
+                missing = str(error)
             except Exception as error:
                 LOGGER.exception("a chart could not be drawn")
-                chart = _Chart(title, None, f"it could not be drawn ({error})")
-            charts[tissue].append(chart)
+                missing = f"it could not be drawn ({error})"
+            charts[tissue].append({"title": title, "body": body, "missing": missing})
     shown = [record for record in records if record.state == "failed"] + [r for r in records if r.state != "failed"]
     page: str = template_of("cohort.html", "palpate.cohort").render(
         records=shown[:MOST_ROWS],

@@ -9,7 +9,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from palpate.cohort.resolve import row_key
 from palpate.cohort.task import FAILURE_CLASSES, Limits, Outcome, Row, Task
@@ -53,16 +52,6 @@ def read_mark(folder: Path, *, checked: bool = True) -> Outcome | None:
     except (InputDataError, ResourceError, KeyError, TypeError):
         return None
     return found
-
-
-def document_of(folder: Path, mark: Outcome) -> dict[str, Any] | None:
-    """The result.json that a row's mark vouches for; None where the row is not done, or that file is gone."""
-    if mark.state != "done":
-        return None
-    try:
-        return read_json(folder / RESULT)
-    except InputDataError:
-        return None
 
 
 @contextmanager

@@ -17,7 +17,13 @@ from palpate.study.outputs import make_folder, write_json, write_text
 
 def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write mesh_0.vtu (at rest), mesh_1.vtu ... (each later image), mesh.pvd, and groups.vtm with groups/*.vtp."""
-    blocks = [("mesh", write_states(model, body, folder)[-1])]
+    space, states = body.space, list[str]()
+    cells = cell_data(body.mesh, body.element_moduli(model.moduli), called=model.modulus_name)
+    for number, displacement in enumerate((np.zeros_like(space.points), *body.displacements)):
+        states.append(f"mesh_{number}.vtu")
+        write_moved(folder / states[-1], space, displacement, cells)
+    write_pvd(folder / "mesh.pvd", [(float(number), name) for number, name in enumerate(states)])
+    blocks = [("mesh", states[-1])]
     make_folder(folder / "groups")
     moved = {"displacement_mm": body.displacements[-1][: len(body.mesh.nodes)]}
     for number, group in enumerate(face_groups(body.mesh)):
@@ -30,17 +36,6 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     )
     heading = '<?xml version="1.0"?>\n<VTKFile type="vtkMultiBlockDataSet" version="1.0">'
     write_text(folder / "groups.vtm", f"{heading}<vtkMultiBlockDataSet>{sets}</vtkMultiBlockDataSet></VTKFile>\n")
-
-
-def write_states(model: FittedModel, body: FittedBody, folder: Path) -> list[str]:
-    """Write the mesh at rest and as each later image has it, each with its displacement; gives the files' names."""
-    space, names = body.space, []
-    cells = cell_data(body.mesh, body.element_moduli(model.moduli), called=model.modulus_name)
-    for number, displacement in enumerate((np.zeros_like(space.points), *body.displacements)):
-        names.append(f"mesh_{number}.vtu")
-        write_moved(folder / names[-1], space, displacement, cells)
-    write_pvd(folder / "mesh.pvd", [(float(number), name) for number, name in enumerate(names)])
-    return names
 
 
 def write_paraview(model: FittedModel, body: FittedBody, folder: Path) -> None:

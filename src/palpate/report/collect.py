@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import PalpateError
+from palpate.images.distance import smoothing_width
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.mechanics.element import largest_strains
@@ -34,7 +35,7 @@ from palpate.report.report_data import (
     TriangleSurface,
 )
 from palpate.report.stiffness_maps import tissue_maps
-from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, contour_width, image_surface, model_surface
+from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, image_surface, model_surface
 from palpate.report.volume import MOVING, Grey, background, earlier_grey, later_grey, slice_box, whole_box, whole_images
 from palpate.study.case import Case
 from palpate.study.result import CaseResult, MeshSummary, failure_document, stated_unit
@@ -258,7 +259,7 @@ def _reference(drawing: _Drawing) -> Reference:
 def _surfaces(drawing: _Drawing, image: Segmentation) -> tuple[TriangleSurface, ...]:
     """Surfaces of the moving tissues and, coarser, of the rigid ones in an image."""
     result = drawing.pair.result
-    width = contour_width(result)
+    width = smoothing_width(result.before.grid, *(image.grid for image in result.after))  # as the mesh: comparable
     found = []
     shown = SHOWN if result.after else (Role.ESTIMATE, Role.KNOWN)  # of a body that comes as a mesh: all of it
     for i in sorted(_indices(result, shown), key=lambda i: result.tissues[i].role is Role.RIGID):

@@ -18,7 +18,6 @@ from palpate.report.report_data import (
     GREY_STEPS,
     LaterImage,
     MeasuredState,
-    MeshPicture,
     Reference,
     ReportData,
     SliceBox,
@@ -70,7 +69,7 @@ class _Packer:
 def payload(data: ReportData, preview: Sequence[PreviewImage] = ()) -> Payload:
     """Pack what the page draws itself; preview: what it draws of each later image where nothing is fitted yet."""
     low, step = _quantum(data)
-    packer = _Packer(low, step)
+    packer, mesh = _Packer(low, step), data.mesh
     facts = {
         "preview": [
             {
@@ -108,7 +107,16 @@ def payload(data: ReportData, preview: Sequence[PreviewImage] = ()) -> Payload:
         ],
         "later": [_later(data, later, packer) for later in data.later],
         "measured": [_measured(state, packer) for state in data.measured],
-        "mesh": _mesh(data.mesh, packer),
+        "mesh": None
+        if mesh is None or len(mesh.tets) > MOST_TETS
+        else {
+            "nodes": packer.points(mesh.nodes),
+            "tets": packer.indices(mesh.tets),
+            "region": packer.add(mesh.region.astype(np.uint8)),
+            "worst": packer.add(np.clip(mesh.angles.min(axis=1), 0.0, 255.0).astype(np.uint8)),
+            "strain": packer.add(np.clip(np.rint(100.0 * mesh.strains / STRAIN_STEP), 0.0, 255.0).astype(np.uint8)),
+            "strainStep": STRAIN_STEP,
+        },
         "angles": _scale(angle_scale()),
         "strains": _scale(strain_scale()),
         "moduli": _scale(modulus_scale(data)) if any(t.modulus for t in data.tissues) else None,
@@ -210,19 +218,6 @@ def _measured(state: MeasuredState, packer: _Packer) -> dict[str, Any]:
             }
             for of in state.points
         ],
-    }
-
-
-def _mesh(mesh: MeshPicture | None, packer: _Packer) -> dict[str, Any] | None:
-    if mesh is None or len(mesh.tets) > MOST_TETS:
-        return None
-    return {
-        "nodes": packer.points(mesh.nodes),
-        "tets": packer.indices(mesh.tets),
-        "region": packer.add(mesh.region.astype(np.uint8)),
-        "worst": packer.add(np.clip(mesh.angles.min(axis=1), 0.0, 255.0).astype(np.uint8)),
-        "strain": packer.add(np.clip(np.rint(100.0 * mesh.strains / STRAIN_STEP), 0.0, 255.0).astype(np.uint8)),
-        "strainStep": STRAIN_STEP,
     }
 
 

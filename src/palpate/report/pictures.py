@@ -12,7 +12,7 @@ from palpate.mesh import outer_faces
 from palpate.mesh.surface import triangle_normals, vertex_normals
 from palpate.report.render import Arrows, Camera, Triangles, render_png
 from palpate.report.report_data import LaterImage, MeasuredState, MeshPicture, ReportData
-from palpate.report.scales import Scale, distance_scale, modulus_scale, strain_scale
+from palpate.report.scales import distance_scale, modulus_scale, strain_scale
 
 WIDTH, HEIGHT = 620, 460
 BESIDE = Camera.looking((-1.0, 0.3, 0.15))  # the patient's left side, a little from the front
@@ -71,8 +71,11 @@ def mesh_png(data: ReportData, *, by: Literal["tissue", "modulus", "strain"]) ->
     faces, tets = section_faces(mesh, axis=0, position=middle)
     if by == "strain":
         shades = strain_scale().colours(100.0 * mesh.strains[tets].astype(np.float64))
+    elif by == "modulus":
+        moduli = [np.nan if tissue.modulus is None else tissue.modulus for tissue in data.tissues]
+        shades = modulus_scale(data).colours(np.array(moduli, dtype=np.float64))[mesh.region[tets]]
     else:
-        shades = tissue_shades(data, modulus_scale(data) if by == "modulus" else None)[mesh.region[tets]]
+        shades = np.array([to_rgb(tissue.colour) for tissue in data.tissues])[mesh.region[tets]]
     corners = mesh.nodes.astype(np.float64)[faces]
     colours = np.repeat(shades[:, None], 3, axis=1)
     triangles = Triangles(corners, colours, np.repeat(face_normals(corners)[:, None], 3, axis=1), edges=True)
@@ -83,14 +86,6 @@ def face_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit normals (n, 3) of triangles (n, 3, 3)."""
     normal = triangle_normals(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
     return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
-
-
-def tissue_shades(data: ReportData, scale: Scale | None) -> NDArray[np.float64]:
-    """Colours (n_tissues, 3), dimensionless, 0 to 1: the tissues' own, or those of their moduli on `scale`."""
-    if scale is None:
-        return np.array([to_rgb(tissue.colour) for tissue in data.tissues])
-    moduli = [np.nan if tissue.modulus is None else tissue.modulus for tissue in data.tissues]
-    return scale.colours(np.array(moduli, dtype=np.float64))
 
 
 def section_faces(mesh: MeshPicture, *, axis: int, position: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -94,7 +94,7 @@ def conclude(
     if minimum.converged:  # of each kind of data in what is known of a tissue's modulus
         of_tissues = information_shares(minimum.evaluation, objective.n_parameters)
         shares = dict(zip(objective.parameters.tissues, of_tissues, strict=False))
-    forces, points = _measured(inversion, observed)
+    fits, forces, points = _seen(inversion, observed)
     findings = (
         *inversion_findings(inversion, covariance.total),
         *remark,
@@ -112,7 +112,7 @@ def conclude(
         poisson_ratios=ratios_of(inversion, known, covariance),
         covariance=covariance,
         starts=tuple(_start(inversion, start) for start in inversion.starts),
-        fits=_fits(inversion, observed),
+        fits=fits,
         forces=forces,
         points=points,
         displacements=tuple(state.displacement for state in observed.states),
@@ -219,9 +219,11 @@ def _fit(line: Linearisation, modelled: NDArray[np.int16] | None, image: NDArray
     return replace(found, dice=overlap)
 
 
-def _measured(inversion: Inversion, observed: Observed) -> tuple[tuple[ForceFit, ...], tuple[PointFit, ...]]:
-    """Readings of instruments, and the points of all observations that have some, beside what the fitted model says."""
-    forces, points = list[ForceFit](), list[PointFit]()
+def _seen(
+    inversion: Inversion, observed: Observed
+) -> tuple[tuple[tuple[TissueFit, ...], ...], tuple[ForceFit, ...], tuple[PointFit, ...]]:
+    """All that was observed beside what the fitted model says: in each later image, by instruments, at points."""
+    fits, forces, points = list[tuple[TissueFit, ...]](), list[ForceFit](), list[PointFit]()
     for line in inversion.minimum.evaluation.linearisations:
         seen, name = line.observation, line.observation.name
         if isinstance(seen, OfInstrument):
@@ -232,16 +234,11 @@ def _measured(inversion: Inversion, observed: Observed) -> tuple[tuple[ForceFit,
             stated = line.observation.first_noise((line.observation,)).sd
             misfit = float(np.sqrt(np.mean(line.residuals.values**2))) / stated
             points.append(PointFit(name, line.state, motions, misfit))
-    return tuple(forces), tuple(points)
-
-
-def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ...], ...]:
-    fits = []
-    for s, (fitted, image) in enumerate(zip(observed.states, observed.images, strict=True)):
-        motions = (np.zeros_like(fitted.displacement), fitted.displacement)
-        modelled = [None if image is None else voxelise(fitted.space, u, fitted.after, crossing=True) for u in motions]
-        seen = zip(inversion.rest.linearisations, inversion.minimum.evaluation.linearisations, strict=True)
-        of_state = [pair for pair in seen if pair[0].state == s and pair[0].observation.unit == "mm"]
+    for s, (state, image) in enumerate(zip(observed.states, observed.images, strict=True)):
+        ways = (np.zeros_like(state.displacement), state.displacement)
+        modelled = [None if image is None else voxelise(state.space, u, state.after, crossing=True) for u in ways]
+        lines = zip(inversion.rest.linearisations, inversion.minimum.evaluation.linearisations, strict=True)
+        of_state = [pair for pair in lines if pair[0].state == s and pair[0].observation.unit == "mm"]
         fits.append(
             tuple(
                 TissueFit(
@@ -253,4 +250,4 @@ def _fits(inversion: Inversion, observed: Observed) -> tuple[tuple[TissueFit, ..
                 for start, end in of_state
             )
         )
-    return tuple(fits)
+    return tuple(fits), tuple(forces), tuple(points)

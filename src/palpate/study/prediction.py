@@ -36,11 +36,6 @@ class PredictedModulus:
     why: str
     shares: Mapping[str, float] = field(default_factory=dict)
 
-    @property
-    def unit_text(self) -> str:
-        """The unit behind a number."""
-        return "kPa" if self.unit == "kPa" else f"times {self.relative_to}"
-
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
@@ -57,11 +52,13 @@ class Prediction:
 
     def lines(self) -> list[str]:
         """A line a modulus, for people."""
-        return [
-            f"predicted for {of.tissue}, if it has {of.guess:.3g} {of.unit_text}: 95 % interval"
-            f" {ends_text(of.interval95)} {of.unit_text} ({of.verdict})"
-            for of in self.moduli
-        ]
+        lines = []
+        for of in self.moduli:
+            unit = "kPa" if of.unit == "kPa" else f"times {of.relative_to}"
+            ends = " to ".join("–" if end is None else f"{end:.3g}" for end in of.interval95)
+            guess = f"predicted for {of.tissue}, if it has {of.guess:.3g} {unit}"
+            lines.append(f"{guess}: 95 % interval {ends} {unit} ({of.verdict})")
+        return lines
 
     def to_dict(self) -> dict[str, Any]:
         """For a JSON document."""
@@ -84,12 +81,6 @@ class Prediction:
                 for of in self.moduli
             ],
         }
-
-
-def ends_text(interval: Interval) -> str:
-    """As "2 to 5", an open end as a dash."""
-    low, high = ("–" if end is None else f"{end:.3g}" for end in interval)
-    return f"{low} to {high}"
 
 
 @blas_on_one_thread()

@@ -64,10 +64,13 @@ def read_segmentation(
     `names`: the label table (label -> name), if the case has one; an image that brings its own names is read by those.
     `tissues`: those of the reference image, for an image without names. Raises as `read_states` does.
     """
-    grey = _grey(case, path)
+    images, grey = case.images, None  # of the state that the label image shows
+    if images is not None:
+        later = dict(zip(images.after, images.intensities_after, strict=False))
+        grey = images.intensities_before if path == images.before else later.get(path)
     on = grey if format_of(path).read_on is not None else None  # for files that may lack their grid
     image = read_label_image(path, names=names, grid=None if on is None else read_intensities(on)[1])
-    if case.images is not None and case.images.body_from_ct:  # label 0 inside the body as one that no tissue claims
+    if images is not None and images.body_from_ct:  # label 0 inside the body as one that no tissue claims
         body = image.labels == 0
         if grey is not None:
             body &= ~outside_body(*read_intensities(grey), image.grid)
@@ -77,15 +80,6 @@ def read_segmentation(
     found = segment(image, case.resolve_tissues(image.names) if tissues is None or image.names else tissues)
     refuse_large(found, path)
     return found
-
-
-def _grey(case: Case, path: Path) -> Path | None:
-    """The grey image of the state that the label image at `path` shows."""
-    images = case.images
-    if images is None:
-        return None
-    later = dict(zip(images.after, images.intensities_after, strict=False))
-    return images.intensities_before if path == images.before else later.get(path)
 
 
 def phantom_scene(case: Case) -> Scene:
