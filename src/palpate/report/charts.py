@@ -62,7 +62,7 @@ def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name
     return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
-def forces_svg(data: ReportData) -> str:
+def forces_svg(data: ReportData, *, name: str) -> str:
     """Each measured force (N) with its 95 % interval as a bar, the fitted one as a dot, one below the other, as SVG."""
     forces = data.document["forces"]
     told = [
@@ -85,16 +85,16 @@ def forces_svg(data: ReportData) -> str:
         axes.xaxis.set_major_locator(MaxNLocator(5))
 
     size = (SIZE[0], ROW_INCHES * len(forces) + 0.75)
-    return draw_svg(draw, size=size, name="forces", says=f"Forces: {'; '.join(told)}.")
+    return draw_svg(draw, size=size, name=name, says=f"Forces: {'; '.join(told)}.")
 
 
-def objective_svg(data: ReportData) -> str:
+def objective_svg(data: ReportData, *, name: str) -> str:
     """Misfit (mm^2) of every start, and of the outer loop from their middle, against the iteration, as SVG."""
     histories = [start["history_mm2"] for start in data.document["starts"]]
     histories.append(data.document["outer_loop"]["history_mm2"])
     paths = [list(np.array(history, dtype=np.float64)) for history in histories]  # NaN for nothing
     says = f"Misfit by iteration. {_told(paths, 'mm²')}"
-    return draw_svg(lambda figure: _paths(figure, paths, "misfit (mm²)"), size=SIZE, name="misfit", says=says)
+    return draw_svg(lambda figure: _paths(figure, paths, "misfit (mm²)"), size=SIZE, name=name, says=says)
 
 
 def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
@@ -118,7 +118,7 @@ def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
     return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
-def waterfall_svg(data: ReportData) -> str:
+def waterfall_svg(data: ReportData, *, name: str) -> str:
     """Final misfits (mm^2) of the starts from the best to the worst, as SVG; hollow where a start did not converge."""
     starts = data.document["starts"]
     ends = np.array([start["objective_mm2"] for start in starts], dtype=np.float64)
@@ -146,10 +146,10 @@ def waterfall_svg(data: ReportData) -> str:
         axes.grid(visible=True, axis="y")
 
     says = f"Final misfits from the best to the worst start, mm²: {told}."
-    return draw_svg(draw, size=SIZE, name="waterfall", says=says)
+    return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
-def angle_svg(angles: NDArray[np.float32]) -> str:
+def angle_svg(angles: NDArray[np.float32], *, name: str) -> str:
     """Histogram of a mesh's dihedral angles (n, 6), degrees, as SVG."""
     flat = angles.ravel()
 
@@ -167,7 +167,7 @@ def angle_svg(angles: NDArray[np.float32]) -> str:
 
     least, middle, most = np.percentile(flat, [0.0, 50.0, 100.0])
     says = f"Dihedral angles of the mesh: from {least:.0f} to {most:.0f} degrees, half of them below {middle:.0f}."
-    return draw_svg(draw, size=SIZE, name="angles", says=says)
+    return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
 def profile_svg(data: ReportData, estimate: int, *, name: str) -> str:

@@ -112,7 +112,7 @@ def collect(result: CaseResult) -> ReportData:
     histories = [*(start.history for start in result.estimation.starts), result.estimation.outer_loop]
     return ReportData(
         document=result.to_dict(),
-        created=_now(),
+        created=f"{datetime.now(UTC):%Y-%m-%d %H:%M UTC}",
         settings=_settings(result.case, result.mesh_summary),
         tissues=report_tissues(result.tissues, result.stiffness),
         unit=result.unit,
@@ -135,15 +135,11 @@ def collect_failure(case: Case, error: PalpateError) -> ReportData:
     tissues = tuple(tissue.with_labels(()) for tissue in case.tissues)
     return ReportData(
         document=failure_document(case, error),
-        created=_now(),
+        created=f"{datetime.now(UTC):%Y-%m-%d %H:%M UTC}",
         settings=_settings(case),
         tissues=report_tissues(tissues, np.full(len(tissues), np.nan)),
         unit=stated_unit(case),
     )
-
-
-def _now() -> str:
-    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def _settings(case: Case, mesh: MeshSummary | None = None) -> tuple[tuple[str, str], ...]:

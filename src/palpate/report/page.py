@@ -114,7 +114,9 @@ def render(data: ReportData, *, study: bool = False) -> str:
         later=tuple(_later(data, k, later) for k, later in enumerate(data.later)),
         measured=tuple(_measured(data, k, state) for k, state in enumerate(data.measured)),
         forces=(
-            picture_of("Measured and fitted forces", partial(forces_svg, data)) if data.document.get("forces") else None
+            picture_of("Measured and fitted forces", partial(forces_svg, data, name="forces"))
+            if data.document.get("forces")
+            else None
         ),
         maps=tuple(_map(data, k, of) for k, of in enumerate(data.maps)),
         mesh_pictures=_mesh_pictures(data),
@@ -128,7 +130,11 @@ def render(data: ReportData, *, study: bool = False) -> str:
         ),
         tornados=of_moduli("{}", tornado, "change", lambda _: data.document.get("variations")),
         repeats=of_moduli("Repeats of {}", repeats_svg, "repeats", lambda _: data.document["image_pairs"]),
-        angles=(picture_of("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles)) if data.mesh else None),
+        angles=(
+            picture_of("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))
+            if data.mesh
+            else None
+        ),
         methods=(  # where nothing converged there is no result whose methods could be told
             _attempt("the methods text", lambda: methods_text(data)) if data.document["status"] == "converged" else None
         ),
@@ -248,8 +254,8 @@ def _curves(data: ReportData) -> tuple[Picture, ...]:
         for i, item in enumerate(moduli_in(data.document))
     ]
     return (
-        picture_of("Misfit", partial(objective_svg, data)),
-        picture_of("Waterfall of the starts", partial(waterfall_svg, data)),
+        picture_of("Misfit", partial(objective_svg, data, name="misfit")),
+        picture_of("Waterfall of the starts", partial(waterfall_svg, data, name="waterfall")),
         *moduli,
     )
 

@@ -116,5 +116,5 @@ def refuse_other_page(path: Path) -> None:
 
 
 def _page(checked: Checked, missing: str) -> str:
-    created = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    return preview_page(checked, created=created, version=software_versions().get("palpate", ""), no_prediction=missing)
+    created, version = f"{datetime.now(UTC):%Y-%m-%d %H:%M UTC}", software_versions().get("palpate", "")
+    return preview_page(checked, created=created, version=version, no_prediction=missing)
