@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,20 +36,14 @@ class Methods:
     bibtex: str
 
 
-@dataclass(frozen=True, slots=True)
-class _Citations:
-    """Numbers the sources in the order in which they are cited."""
-
-    cited: dict[str, int]
-
-    def __call__(self, *keys: str) -> str:
-        numbers = [self.cited.setdefault(key, len(self.cited) + 1) for key in keys]
-        return "[" + ", ".join(str(number) for number in numbers) + "]"
-
-
 def methods_text(data: ReportData) -> Methods:
     """What was done to the images of this case, in sentences that can be taken over."""
-    cite = _Citations({})
+    cited: dict[str, int] = {}
+
+    def cite(key: str) -> str:
+        """The number of a source, in the order in which they are cited."""
+        return f"[{cited.setdefault(key, len(cited) + 1)}]"
+
     leaning = listed([item["tissue"] for item in moduli_in(data.document) if item.get("interval_kind") == "profile"])
     if leaning:
         leaning = f"; of {leaning}, whose profile likelihood leans to one side, its ends are those of the profile"
@@ -84,12 +78,12 @@ def methods_text(data: ReportData) -> Methods:
     sources = SOURCES | {"palpate": replace(own, fields={**own.fields, **version})}
     return Methods(
         paragraphs,
-        tuple(reference_line(sources[key]) for key in cite.cited),
-        "\n\n".join(bibtex(key, sources[key]) for key in cite.cited),
+        tuple(reference_line(sources[key]) for key in cited),
+        "\n\n".join(bibtex(key, sources[key]) for key in cited),
     )
 
 
-def _aim(data: ReportData, cite: _Citations) -> str:
+def _aim(data: ReportData, cite: Callable[[str], str]) -> str:
     roles: dict[str, list[str]] = {}
     for tissue in data.tissues:
         roles.setdefault(tissue.role, []).append(tissue.name)
@@ -109,7 +103,7 @@ def _aim(data: ReportData, cite: _Citations) -> str:
     )
 
 
-def _model(data: ReportData, cite: _Citations) -> str:
+def _model(data: ReportData, cite: Callable[[str], str]) -> str:
     document: Mapping[str, Any] = data.document
     mesh = document["mesh"]
     size = f" of {mesh['tets']} tetrahedra with {mesh['dofs']} unknowns" if mesh else ""

@@ -42,22 +42,12 @@ class GuessedTissue:
     question: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class _Rule:
-    """Words of a name, a role, and what the words mean; `rest`: the label goes to the surroundings."""
-
-    words: frozenset[str]
-    role: Role | None
-    meaning: str
-    rest: bool = False
-
-
 def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-RULES = tuple(
-    _Rule(_words(entry["words"]), Role(entry["role"]) if "role" in entry else None, entry["meaning"], "rest" in entry)
+RULES = tuple(  # words of a name, a role, what the words mean, whether the label goes to the surroundings
+    (_words(entry["words"]), Role(entry["role"]) if "role" in entry else None, entry["meaning"], "rest" in entry)
     for entry in TABLE["role"]
 )
 
@@ -125,17 +115,17 @@ def _guess(label: int, before: LabelImage, after: Sequence[LabelImage], border: 
     words = _words_of(name)
     if label == 0 and words <= UNLABELLED:  # as tables call what no organ is, inside the body and outside
         return _by_place(label, before, after, border)
-    for rule in RULES:
-        found = sorted(words & rule.words)
+    for known, role, meaning, rest in RULES:
+        found = sorted(words & known)
         if found:
-            reason = f"'{found[0]}' {rule.meaning}"
-            if rule.rest:
-                return GuessedTissue(SURROUNDINGS, (label,), Role.KNOWN, f"'{name}' {rule.meaning}")
-            usual = usual_stiffness(name) if rule.role is Role.KNOWN else None
+            reason = f"'{found[0]}' {meaning}"
+            if rest:
+                return GuessedTissue(SURROUNDINGS, (label,), Role.KNOWN, f"'{name}' {meaning}")
+            usual = usual_stiffness(name) if role is Role.KNOWN else None
             return GuessedTissue(
                 name,
                 (label,),
-                rule.role,
+                role,
                 reason if usual is None else f"{reason}: {usual.reference}",
                 None if usual is None else usual.usual_kpa,
             )
