@@ -77,7 +77,8 @@ def payload(data: ReportData, preview: Sequence[PreviewImage] = ()) -> Payload:
                 "whole": [_volume(volume, packer) for volume in image.whole],
                 "greys": [_volume(volume, packer) for volume in image.greys],
                 "arrows": [
-                    {"tissue": a.tissue, "start": a.start.tolist(), "end": a.end.tolist()} for a in image.arrows
+                    {"tissue": tissue, "start": start.tolist(), "end": end.tolist()}
+                    for tissue, start, end in image.arrows
                 ],
                 "factor": image.factor,
                 "view": _box(image.view),

@@ -34,29 +34,20 @@ LONGEST_ARROW_MM = 20.0  # as it is drawn
 
 
 @dataclass(frozen=True, slots=True)
-class Arrow:
-    """The motion of the middle of a tissue (index) from `start` (3,) to `end` (3,) RAS mm."""
-
-    tissue: int
-    start: NDArray[np.float64]
-    end: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
 class PreviewImage:
     """One later image of a preview: labels and grey values of both states, and lines of what is held.
 
     organs, whole: labels of the first image, of this one aligned, and of this one as it lies where that is another
     place, in the box around the organs and in that of the whole image; greys: of both states, None where a case gives
-    none; motion (3, 4): of the aligned surfaces back to where they lie, RAS mm; factor: how many times longer than it
-    is an arrow is drawn; view: what slices of the whole show; frame, field: corners (8, 3) RAS mm of the box that is
-    meshed, and of this image's grid.
+    none; arrows: a tissue (index) with its middle before and after, (3,) RAS mm each; factor: how many times longer
+    than it is an arrow is drawn; motion (3, 4): of the aligned surfaces back to where they lie, RAS mm; view: what
+    slices of the whole show; frame, field: corners (8, 3) RAS mm of the box that is meshed, and of this image's grid.
     """
 
     organs: tuple[Volume, ...]
     whole: tuple[Volume, ...]
     greys: tuple[Volume | None, ...]
-    arrows: tuple[Arrow, ...]
+    arrows: tuple[tuple[int, NDArray[np.float64], NDArray[np.float64]], ...]
     factor: float
     frame: NDArray[np.float64]
     field: NDArray[np.float64]
@@ -101,11 +92,9 @@ def preview_image(
     images = [before, aligned, *([] if lay is None else [moved(aligned, lay)])]
     whole = whole_box(before)
     arrows = [
-        Arrow(look.tissue, look.middle, look.middle + look.shifts_mm[after])
-        for look in looks
-        if look.middle is not None
+        (look.tissue, look.middle, look.middle + look.shifts_mm[after]) for look in looks if look.middle is not None
     ]
-    longest = max((float(np.linalg.norm(a.end - a.start)) for a in arrows), default=0.0)
+    longest = max((float(np.linalg.norm(end - start)) for _, start, end in arrows), default=0.0)
     rim = RIM * float((whole.high - whole.low).max())
     return PreviewImage(
         organs=tuple(label_volume(image, box) for image in images),

@@ -95,12 +95,6 @@ class _Input:
     errors: Errors
     amounts: tuple[tuple[float, str], ...]
 
-    @property
-    def range(self) -> Range:
-        """From the least to the largest of its amounts."""
-        ends = [amount for amount, _ in self.amounts]
-        return Range(self.cause, self.subject, min(ends), max(ends), self.unit)
-
 
 def voxel_mm(later: Sequence[Segmentation]) -> float:
     """Mean edge, mm, of the voxels of later images; 1 where there are none."""
@@ -208,7 +202,7 @@ def sobol_result(
     mapping = inversion.objective.parameters
     of = _inputs(inversion, _equilibria(inversion), tissues, dilatation, voxel_mm)
     inputs = [each for each in of if each.subject != ALL]
-    ranges = [each.range for each in inputs]
+    ranges = [Range(i.cause, i.subject, min(i.amounts)[0], max(i.amounts)[0], i.unit) for i in inputs]
     # what changes no residual: a known modulus that alone sets the scale, and the drivers' prior
     if _exact(inversion, tissues):
         (known,) = {tissue.name for tissue in tissues if tissue.role is Role.KNOWN}
