@@ -310,29 +310,23 @@ def test_the_same_seed_gives_the_same_statement(inversion, settings, observed, e
 
 @pytest.fixture(scope="module")
 def sampled(inversion, settings, observed):
-    return conclude(inversion, settings, observed, truth={}, seed=1, samples=400)
-
-
-@pytest.fixture(scope="module")
-def short(inversion, settings, observed):
-    """Chains of no more than a hundred draws."""
-    return conclude(inversion, settings, observed, truth={}, seed=1, samples=100)
+    return conclude(inversion, settings, observed, truth={}, seed=1, samples=800)
 
 
 def test_chains_of_samples_agree_and_hold_what_they_state(sampled):
     samples = sampled.samples
-    assert (samples.tissues, samples.unit, samples.moduli.shape) == (("gland", "sac"), "kPa", (4, 400, 2))
+    assert (samples.tissues, samples.unit, samples.moduli.shape) == (("gland", "sac"), "kPa", (4, 800, 2))
     assert samples.diagnostics.mixed.all()
-    assert np.all((samples.diagnostics.r_hat > 0.99) & (samples.diagnostics.ess_bulk < 1600))
+    assert np.all((samples.diagnostics.r_hat > 0.99) & (samples.diagnostics.ess_bulk < 3200))
     for interval, draws in zip(samples.interval95, samples.moduli.T, strict=True):
         assert np.mean((draws >= interval[0]) & (draws <= interval[1])) == pytest.approx(0.95, abs=1e-3)
 
 
 def test_samples_lean_as_the_profile_does_which_no_stretch_of_them_can_make(twins, twin, observed):
-    """Of moduli that are known to a factor of three: the end that the objective bends away from lies further off."""
-    settings, noise = twins.settings(2.0), NoiseModel(np.array([0.25**2]), np.array([3.0]))
+    """Of moduli that are known to a factor of two: the end that the objective bends away from lies further off."""
+    settings, noise = twins.settings(2.0), NoiseModel(np.array([0.18**2]), np.array([3.0]))
     inversion = invert(twins.exact_problem(twin, noise=noise), settings, progress=twins.silent)
-    found = conclude(inversion, settings, observed, truth={}, seed=1, samples=1000)
+    found = conclude(inversion, settings, observed, truth={}, seed=1, samples=2000)
     leans = []
     for estimate, drawn in zip(found.estimates, found.samples.moduli.T, strict=True):
         low, high = np.quantile(drawn, [0.025, 0.975])
@@ -345,19 +339,20 @@ def test_samples_lean_as_the_profile_does_which_no_stretch_of_them_can_make(twin
 
 
 def test_the_estimates_do_not_rest_on_the_samples_which_repeat_with_the_seed(
-    sampled, short, estimation, inversion, settings, observed
+    sampled, estimation, inversion, settings, observed
 ):
     assert estimation.samples is None
     assert [e.interval95 for e in sampled.estimates] == [e.interval95 for e in estimation.estimates]
-    again, other = (
-        conclude(inversion, settings, observed, truth={}, seed=seed, samples=100).samples.moduli for seed in (1, 2)
+    first, second, other = (
+        conclude(inversion, settings, observed, truth={}, seed=seed, samples=100).samples.moduli for seed in (1, 1, 2)
     )
-    assert np.array_equal(again, short.samples.moduli)
-    assert not np.array_equal(other, short.samples.moduli)
+    assert np.array_equal(first, second)
+    assert not np.array_equal(first, other)
 
 
-def test_chains_that_are_too_short_are_remarked_with_what_to_do(sampled, short):
+def test_chains_that_are_too_short_are_remarked_with_what_to_do(sampled, inversion, settings, observed):
     assert "samples-not-mixed" not in codes(sampled)
+    short = conclude(inversion, settings, observed, truth={}, seed=1, samples=100)
     (remark,) = (remark for remark in short.remarks if remark.code == "samples-not-mixed")
     assert "gland (R-hat 1." in remark.message
     assert "--samples 400" in remark.message

@@ -40,7 +40,7 @@ youngs_modulus_kpa = 10.0
 """
 COARSE = [
     *("mechanics.law=linear", "mechanics.element=P1", "mesh.edge_length_mm=8", "driver.modes=12"),
-    *("estimate.start_ratios=[3.0]", "discrepancy={layer_sd=0, heterogeneity_sd=0}"),
+    *("estimate.start_ratios=[3.0]", "estimate.samples=100", "discrepancy.layer_sd=0"),
 ]
 PAIR = """
 [[pairs]]
@@ -86,8 +86,11 @@ def test_both_pairs_have_their_fit_mesh_and_digest_under_one_set_of_moduli(outpu
         assert fit["shell"]["end"]["rms_mm"] < 0.6 * fit["shell"]["start"]["rms_mm"]
     assert result["pairs"][0]["mesh"]["tets"] != result["mesh"]["tets"]
     assert {"before", "after[0]", "pairs[0].before", "pairs[0].after[0]"} == set(result["inputs"])
-    page, meshes = {"report.html", "report-data.npz"}, {"mesh.vtu", "mesh_2.vtu", "model.npz"}
+    page, meshes = {"report.html", "report-data.npz"}, {"mesh.vtu", "mesh_2.vtu", "model.npz", "posterior.nc"}
     assert set(result["files"]) == meshes | page | {"stiffness.nii.gz", "labels.csv", "labels.nii.gz", "case.toml"}
+    for found, estimate in zip(result["samples"]["moduli"], result["estimates"], strict=True):
+        assert found["tissue"] == estimate["tissue"]
+        assert found["interval95"][0] < estimate["value"] < found["interval95"][1]
     page = (outputs / "report.html").read_text()
     assert "Slices: before_2.nii.gz" in page
     assert "Slices: before_3.nii.gz" in page

@@ -63,7 +63,6 @@ modes = 8
 
 [discrepancy]
 layer_sd = 0.0
-heterogeneity_sd = 0.0
 
 [estimate]
 parameters = ["youngs_modulus", "poisson_ratio"]

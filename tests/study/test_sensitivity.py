@@ -63,7 +63,6 @@ outer_boundary = "fixed"
 heterogeneity_sd = 0.0
 poisson_sd = 0.0
 surface_offset_mm = 0.0
-layer_sd = 0.0
 
 [estimate]
 start_ratios = [3.0]
