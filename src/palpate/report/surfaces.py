@@ -8,7 +8,7 @@ import igl
 import numpy as np
 from scipy import ndimage
 
-from palpate.images.distance import observation_width, window_around
+from palpate.images.distance import observation_width, smoothing_width, window_around
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import cropped, tissue_distance_map
 from palpate.mesh.surface import tissue_surface, triangle_normals
@@ -56,8 +56,8 @@ def model_surface(result: CaseResult, tissue: int, after: int) -> ModelSurface:
     motion = result.estimation.displacements[after][surface.points]
     fitted = surface.rest + motion
     reach = float(np.linalg.norm(motion, axis=1).max()) + ROOM_MM
-    before = tissue_distance_map(result.before, tissue, smoothing_mm=width, reach_mm=ROOM_MM, far=False)
-    later = tissue_distance_map(result.after[after], tissue, smoothing_mm=width, reach_mm=reach)
+    images = (result.before, result.after[after])
+    before, later = (tissue_distance_map(image, tissue, smoothing_mm=width, reach_mm=reach) for image in images)
     level = before.at(surface.rest)
     # around each point: a third of each of its observed triangles
     size = np.linalg.norm(triangle_normals(surface.rest, surface.triangles), axis=1) * surface.observed
@@ -87,3 +87,8 @@ def carried_outline(result: CaseResult, outline: TriangleSurface, after: int) ->
     weights = igl.barycentric_coordinates(places, *(np.ascontiguousarray(space.mesh.nodes[c]) for c in corners.T))
     motion = space.interpolation(corners, weights) @ result.estimation.displacements[after]
     return replace(outline, points=(points + motion).astype(np.float32))
+
+
+def contour_width(result: CaseResult) -> float:
+    """Smoothing (mm) of the images' surfaces in figures: that of the mesh, so that both are comparable."""
+    return smoothing_width(result.before.grid, *(image.grid for image in result.after))
