@@ -8,7 +8,7 @@ import igl
 import numpy as np
 from scipy import ndimage
 
-from palpate.images.distance import observation_width, smoothing_width, window_around
+from palpate.images.distance import observation_width, window_around
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue_distance import cropped, tissue_distance_map
 from palpate.mesh.surface import tissue_surface, triangle_normals
@@ -87,8 +87,3 @@ def carried_outline(result: CaseResult, outline: TriangleSurface, after: int) ->
     weights = igl.barycentric_coordinates(places, *(np.ascontiguousarray(space.mesh.nodes[c]) for c in corners.T))
     motion = space.interpolation(corners, weights) @ result.estimation.displacements[after]
     return replace(outline, points=(points + motion).astype(np.float32))
-
-
-def contour_width(result: CaseResult) -> float:
-    """Smoothing (mm) of the images' surfaces in figures: that of the mesh, so that both are comparable."""
-    return smoothing_width(result.before.grid, *(image.grid for image in result.after))
