@@ -16,7 +16,6 @@ CASE = """
 images = { before = "prone.nii.gz"AFTER }
 domain.outer_boundary = "fixed"  # the images are cut in the chest's wall, which does not move
 mechanics.law = "linear"
-discrepancy.heterogeneity_sd = 0.0  # each tissue is of one material; leave it out for a real breast
 mesh.edge_length_mm = EDGE
 estimate = { starts_kpa = [6.0], bounds_kpa = [0.2, 100.0] }
 [tissues]

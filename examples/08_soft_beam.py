@@ -28,13 +28,13 @@ loads = [{ kind = "gravity", state = 0, acceleration_m_s2 = [0.0, 0.0, -9.81] },
 
 def write_beam(folder: Path) -> None:
     """The hanging beam of 200 kPa as a coarse mesh, and forty markers in it; simulated on a finer mesh."""
-    space = lagrange_space(tetrahedralise(BODY, edge_length_mm=1.1), "P2")
+    space = lagrange_space(tetrahedralise(BODY, edge_length_mm=0.9), "P2")
     none, held = np.zeros((space.points.size, 0)), space.points[:, 0] < 0.001
     clamp = outer_constraint(space, outer="free", modes=none, offset=none.sum(axis=1), prescribed=held)
     how = {"law": law_named("neo-hookean"), "dilatation": choose_element("auto").dilatation}
     weights = [gravity(space, np.array([1000.0]), np.array([0.0, 0.0, g])) for g in (-9.81, 9.81)]
     down, up = (equilibrium(space, clamp, np.array([200.0]), loads=(w,), **how).displacement for w in weights)
-    mesh, rng = tetrahedralise(BODY, edge_length_mm=1.6), np.random.default_rng(0)
+    mesh, rng = tetrahedralise(BODY, edge_length_mm=1.3), np.random.default_rng(0)
     points = rng.uniform(1.0, [49.0, 9.0, 9.0], (40, 3))
     at_nodes, at_points = (point_interpolation(space, located(space.mesh, x)) for x in (mesh.nodes, points))
     meshio.write(folder / "beam.vtu", meshio.Mesh(mesh.nodes + at_nodes @ down, [("tetra", mesh.tets)]))

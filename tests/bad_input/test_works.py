@@ -215,3 +215,17 @@ def test_a_report_is_drawn_again_from_the_files_and_names_what_is_of_no_run(esti
     document = json.loads(done["out"])
     assert (done["code"], document["strange_files"]) == (0, ["mesh.vtu"])
     assert page.stat().st_size == pytest.approx(size, rel=0.01)
+
+
+def test_without_anything_known_a_ratio_is_stated_and_a_bound_leaves_no_interval(good, palpate, tmp_path):
+    folder = Path(shutil.copytree(good, tmp_path / "ratio"))
+    changed(folder, '"known"\nyoungs_modulus_kpa = 10.0', '"estimate"')
+    changed(folder, "[1.0]", "[1.0]\nbounds_ratio = [0.98, 1.02]")
+    held = ("--set", "discrepancy.heterogeneity_sd=0", "--set", "domain.outer_boundary=fixed")  # what bounds forbid
+    done = palpate("estimate", "case.toml", "--output", "out", "--json", "--quiet", *held, cwd=folder)
+    assert done["code"] == 0, done["err"]
+    document = json.loads(done["out"])
+    (item,) = document["estimates"]
+    assert (item["value"], item["unit"], item["verdict"]) == (None, "ratio", "not identified")
+    assert (item["ratio_interval95"], item["interval95_given_model"]) == (None, None)
+    assert "ratio-only" in [warning["code"] for warning in document["warnings"]]

@@ -45,7 +45,7 @@ def test_starts_far_apart_end_in_one_minimum(found):
     assert len(found.candidates) == 1
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", range(3))
 def test_every_start_finds_a_minimum_whatever_the_noise(twins, twin, seed):
     """Under less noise than the images have it would seek one between the places where closest points jump."""
     problem = twins.noisy_problem(twin, sd_mm=0.4, seed=seed)

@@ -98,7 +98,7 @@ def test_the_longest_residual_is_named_with_its_place_and_drawn(measured):
         assert points.largest_label == (EVIL if fit.motions.labels else "")
 
 
-@pytest.mark.parametrize("n", [401, 3000])
+@pytest.mark.parametrize("n", [401, 3000, 20_000])
 def test_of_many_points_some_are_drawn_everywhere(n):
     points = rng.uniform(0.0, 50.0, (n, 3))
     kept = evenly(points, 400)

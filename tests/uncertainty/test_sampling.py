@@ -26,30 +26,12 @@ def objective(request, twins, twin):
     found = twins.objective_of(twins.exact_problem(twin, noise=NOISE), twin.coefficients).rematched(twin.unknowns)
     if request.param == "flat":
         return found
-    return believed(twins, found)
-
-
-def believed(twins, objective):
-    """The same with a normal prior of the log-moduli."""
-    return replace(objective, parameters=objective.parameters.with_prior(twins.TRUTH + 0.02, np.full(2, 0.02)))
+    return replace(found, parameters=found.parameters.with_prior(twins.TRUTH + 0.02, np.full(2, 0.02)))
 
 
 @pytest.fixture(scope="module")
 def minimum(objective, twin):
     return gauss_newton(objective, twin.unknowns, bounds=WIDE).unknowns
-
-
-@pytest.fixture(scope="module")
-def sampled(twins, twin):
-    """What chains are made of, whose steps know a prior by the frozen posterior's value alone: that, minimum and all.
-
-    The prior is the normal one; the laws above hold for a flat one, too.
-    """
-    found = twins.objective_of(twins.exact_problem(twin, noise=NOISE), twin.coefficients).rematched(twin.unknowns)
-    objective = believed(twins, found)
-    minimum = gauss_newton(objective, twin.unknowns, bounds=WIDE).unknowns
-    evaluation = objective(minimum)
-    return frozen_posterior(objective, minimum, evaluation), minimum, evaluation
 
 
 def test_the_frozen_posterior_has_the_value_and_score_of_the_objective_where_it_is_frozen(objective, minimum, rng):
@@ -75,28 +57,29 @@ def test_a_full_model_is_refused(objective, minimum, twin):
         frozen_posterior(replace(objective, states=states), minimum)
 
 
-def test_chains_have_the_covariance_that_is_asked_and_agree_with_each_other(sampled, rng):
-    (frozen, minimum, evaluation), wanted = sampled, np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
-    given = {"bounds": WIDE, "chains": 4, "draws": 300, "rng": rng}
+def test_chains_have_the_covariance_that_is_asked_and_agree_with_each_other(objective, minimum, rng):
+    evaluation, wanted = objective(minimum), np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
+    frozen = frozen_posterior(objective, minimum, evaluation)
+    given = {"bounds": WIDE, "chains": 4, "draws": 500, "rng": rng}
     found = posterior_chains(frozen, minimum, evaluation, wanted, **given)
     theta = found.theta
-    assert theta.shape == (4, 300, 2)
+    assert theta.shape == (4, 500, 2)
     together = theta.reshape(-1, 2)
     assert together.mean(axis=0) == pytest.approx(minimum[:2], abs=0.004)
     assert np.cov(together.T) == pytest.approx(wanted, rel=0.3, abs=5e-5)
     within, between = theta.std(axis=1).mean(axis=0), theta.mean(axis=1).std(axis=0)
     assert np.all(between < 0.25 * within)
     assert np.all((found.accepted > 0.5) & (found.accepted <= 1.0))
-    below = -evaluation.value - found.log_density  # half of chi-squared with as many degrees as unknowns
-    assert below.shape == (4, 300)
+    below = -objective.value(minimum) - found.log_density  # half of chi-squared with as many degrees as unknowns
+    assert below.shape == (4, 500)
     assert below.mean() == pytest.approx(0.5 * len(minimum), rel=0.15)
 
 
-def test_no_draw_of_a_chain_leaves_the_bounds_and_they_cut_the_density_that_is_asked(sampled):
+def test_no_draw_of_a_chain_leaves_the_bounds_and_they_cut_the_density_that_is_asked(objective, minimum):
     """That of a normal law between them, which a draw that is stretched beyond them, or cut before, is none of."""
-    (frozen, minimum, evaluation), wanted = sampled, np.diag([0.05**2, 0.02**2])
-    upper = minimum[:2] + np.array([0.05, 1.0])
-    given = {"bounds": Bounds(WIDE.lower, upper), "chains": 4, "draws": 500, "rng": np.random.default_rng(2)}
+    evaluation, wanted = objective(minimum), np.diag([0.05**2, 0.02**2])
+    frozen, upper = frozen_posterior(objective, minimum, evaluation), minimum[:2] + np.array([0.05, 1.0])
+    given = {"bounds": Bounds(WIDE.lower, upper), "chains": 4, "draws": 800, "rng": np.random.default_rng(2)}
     theta = posterior_chains(frozen, minimum, evaluation, wanted, **given).theta[..., 0].ravel()
     assert theta.max() <= upper[0]
     law = stats.truncnorm(-np.inf, 1.0, loc=minimum[0], scale=0.05)
@@ -104,14 +87,15 @@ def test_no_draw_of_a_chain_leaves_the_bounds_and_they_cut_the_density_that_is_a
     assert law.cdf(np.quantile(theta, levels)) == pytest.approx(levels, abs=0.06)
 
 
-def test_chains_of_several_blocks_have_the_covariance_of_laplace_and_the_same_draws_with_a_seed(sampled):
-    frozen, minimum, evaluation = sampled
+def test_chains_of_several_blocks_have_the_covariance_of_laplace_and_the_same_draws_with_a_seed(objective, minimum):
+    evaluation = objective(minimum)
+    frozen = frozen_posterior(objective, minimum, evaluation)
     own = np.linalg.inv(evaluation.matrix)[:2, :2]
-    given = {"bounds": WIDE, "chains": 1, "draws": 400}  # 4400 steps, of which a block has 4000
+    given = {"bounds": WIDE, "chains": 1, "draws": 600}  # 6600 steps, of which a block has 4000
     first, second = (
         posterior_chains(frozen, minimum, evaluation, own, rng=np.random.default_rng(3), **given) for _ in range(2)
     )
-    assert first.theta.shape == (1, 400, 2)
+    assert first.theta.shape == (1, 600, 2)
     assert np.array_equal(first.theta, second.theta)
     assert np.std(first.theta, axis=(0, 1)) == pytest.approx(np.sqrt(np.diag(own)), rel=0.25)
 
