@@ -88,7 +88,10 @@ def length_text(mm: float) -> str:
 
 
 def registration(before: Segmentation, maps: SurfaceMaps, fit: RigidFit, *, by: str) -> Registration:
-    """What a measured motion does to the organs, and what it leaves of each surface."""
+    """What a measured motion does to the organs, and what it leaves of each surface.
+
+    maps: as of `surface_maps`; by: "rigid-tissues" or "surfaces", on which it was measured.
+    """
     organs = [i for i, tissue in enumerate(before.tissues) if tissue.role is Role.ESTIMATE]
     volumes = {organ: before.volume(organ) for organ in organs if before.mask(organ).any()}
     if volumes:

@@ -43,7 +43,7 @@ LEAST_WEIGHT = 1e-3
 MOST_STEPS = 40
 STEP_TOLERANCE_MM = 1e-3
 
-SurfaceMaps = Mapping[int, tuple[DistanceMap, DistanceMap]]
+SurfaceMaps = Mapping[int, tuple[DistanceMap, DistanceMap]]  # by a tissue's index: in the first image and in the later
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
     surface: K is that of a smooth motion of the tissue's own, alike over 40 mm, of 1.5 mm (a driver: 4 mm), and 1 mm
     from place to place, more where a residual is an outlier (Tukey); shifts of 10 mm and turns of 10 degrees are usual.
     It counts where it makes the images e^5 times as probable as no motion. Raises `InputDataError` when the images
-    share too few surface points.
+    share too few surface points. maps: as of `surface_maps`.
     """
     surfaces, middles = list[_Shown](), list[tuple[NDArray[np.float64], NDArray[np.float64]]]()  # (3,) mm in both
     for tissue, pair in maps.items():

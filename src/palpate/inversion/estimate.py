@@ -220,13 +220,13 @@ def _with_reduced_bases(
 
     Its blocks hold what the images tell of those of the problem.
     """
-    problem, bases, unknowns, cost = informed_problem(problem, middle, bounds=settings.bounds, progress=progress)
-    parameters = problem.parameters
+    informed = informed_problem(problem, middle, bounds=settings.bounds, progress=progress)
+    parameters, unknowns = informed.problem.parameters, informed.unknowns
     progress(f"how the responses to {parameters.n_coefficients} unknowns that are seen change with the moduli")
     by_theta, coefficients = parameters.derivatives(unknowns), parameters.coefficients(unknowns)
-    triples = zip(problem.states, bases, coefficients, strict=True)
+    triples = zip(informed.problem.states, informed.bases, coefficients, strict=True)
     states = tuple(state.with_approximation(basis.with_modulus_series(q, by_theta)) for state, basis, q in triples)
-    return Objective(states, parameters), unknowns, cost
+    return Objective(states, parameters), unknowns, informed.evaluations
 
 
 def _linear(

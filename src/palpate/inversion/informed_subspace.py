@@ -28,13 +28,23 @@ from palpate.unknowns.blocks import Acts, Block
 SMALL = 12  # unknowns of a block, which are kept
 
 
+@dataclass(frozen=True, slots=True)
+class InformedProblem:
+    """An inverse problem on the combinations that are seen, with each state's reduced basis of them.
+
+    unknowns (n_unknowns,): the middle start, with the boundary's motion fitted; evaluations: what that cost.
+    """
+
+    problem: InverseProblem
+    bases: tuple[ReducedBasis, ...]
+    unknowns: NDArray[np.float64]
+    evaluations: int
+
+
 def informed_problem(
     problem: InverseProblem, begin: NDArray[np.float64], *, bounds: Bounds, progress: Progress
-) -> tuple[InverseProblem, tuple[ReducedBasis, ...], NDArray[np.float64], int]:
+) -> InformedProblem:
     """The problem on what the images tell of its blocks, by the responses of the full models at `begin` (n_unknowns,).
-
-    With each state's reduced basis of the combinations that are seen, unknowns (n_unknowns,) of these, the middle start
-    with the boundary's motion fitted, and what that cost in evaluations.
 
     x of a block with the widest covariance C = L L^T is seen along the eigenvectors of L^T A L, A = J^T W J its
     information: an eigenvalue l is the variance that x may explain along one over that of the noise, and what is left
@@ -75,7 +85,7 @@ def informed_problem(
     theta = middle[: parameters.n_parameters]
     fit = [inverse @ middle[own] for own, (_, inverse) in zip(columns, bases, strict=True)]
     seen = InverseProblem(tuple(reduced), replace(parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0))))
-    return seen, tuple(kept), np.concatenate([theta, *fit]), evaluations
+    return InformedProblem(seen, tuple(kept), np.concatenate([theta, *fit]), evaluations)
 
 
 @dataclass(frozen=True, slots=True)

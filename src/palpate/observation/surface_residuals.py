@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import igl
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate.images.distance import terrace_noise
 from palpate.mesh.surface import mean_curvature, triangle_normals, vertex_normals
 from palpate.observation.contract import Residuals
 from palpate.observation.observed_surface import ObservedSurface
@@ -39,6 +38,31 @@ class Correspondence:
         return values if self.shown is None else np.asarray(values[self.shown])
 
 
+@dataclass(frozen=True, slots=True)
+class _Closest:
+    """Closest points of the deformed surface to the image's: triangle (n,), barycentric (n, 3), places (n, 3) mm."""
+
+    triangle: NDArray[np.int64]
+    barycentric: NDArray[np.float64]
+    places: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Direction:
+    """Residuals (n,) of one direction of the distance, as `Residuals` has them.
+
+    corners (n, 3): vertices of the triangle of each; by_corners (n, 3 corners, 3 axes): derivatives by their motion.
+    """
+
+    values: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    places: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    material: NDArray[np.float64]
+    corners: NDArray[np.int64]
+    by_corners: NDArray[np.float64]
+
+
 def surface_residuals(target: SurfaceTarget, displacement: NDArray[np.float64], held: Correspondence) -> Residuals:
     """Residuals and their derivative at a displacement (n_vertices, 3) mm of the surface's points.
 
@@ -49,31 +73,35 @@ def surface_residuals(target: SurfaceTarget, displacement: NDArray[np.float64], 
     vertices = target.surface.rest + displacement
     normals = vertex_normals(vertices, target.surface.triangles)
     both = (_model_to_image(target, vertices, normals, held), _image_to_model(target, vertices, normals, held))
-    found = [np.concatenate(pair) for pair in zip(*both, strict=True)]
-    values, weights, places, along, material, corners, by_corners = found
+    corners = np.concatenate([d.corners for d in both])
     columns = (3 * corners[:, :, None] + np.arange(3)).ravel()
     starts, shape = 9 * np.arange(len(corners) + 1), (len(corners), 3 * len(vertices))
-    jacobian = sparse.csr_matrix((by_corners.ravel(), columns, starts), shape=shape)
-    return Residuals(values, weights, places, along, material, jacobian)
+    by_corners = np.concatenate([d.by_corners for d in both])
+    return Residuals(
+        np.concatenate([d.values for d in both]),
+        np.concatenate([d.weights for d in both]),
+        np.concatenate([d.places for d in both]),
+        np.concatenate([d.normals for d in both]),
+        np.concatenate([d.material for d in both]),
+        sparse.csr_matrix((by_corners.ravel(), columns, starts), shape=shape),
+    )
 
 
 def correspondence(target: SurfaceTarget, displacement: NDArray[np.float64]) -> Correspondence:
     """Of a displacement (n_vertices, 3) mm: which points of either surface are compared; the excess."""
     surface, vertices = target.surface, target.surface.rest + displacement
-    triangle, barycentric, _ = _closest(surface, vertices, target.image_points)
-    at_rim = np.any((barycentric < ON_EDGE) & surface.rim[triangle], axis=1)
-    normals = _within(vertex_normals(vertices, surface.triangles), surface.triangles[triangle], barycentric)
-    kept = surface.observed[triangle] & ~at_rim
+    closest = _closest(surface, vertices, target.image_points)
+    at_rim = np.any((closest.barycentric < ON_EDGE) & surface.rim[closest.triangle], axis=1)
+    corners = surface.triangles[closest.triangle]
+    normals = _within(vertex_normals(vertices, surface.triangles), corners, closest.barycentric)
+    kept = surface.observed[closest.triangle] & ~at_rim
     if target.voxels is None:  # exact maps: nothing is smoothed, and they are made of plane pieces themselves
-        excess, terraces = np.zeros(len(surface.rest)), np.zeros(len(normals))
+        excess = np.zeros(len(surface.rest))
     else:
         widths = tuple(distance.smoothing_mm for distance in target.voxels)
         excess = _shrinkage(surface, displacement, widths) - _bulge(surface, displacement)
-        # along the model's normals: the image's are noisy with the same rounding, and weights that go with the errors
-        # of what they weigh bias it
-        terraces = terrace_noise(*target.voxels, normals)
     shown = None if target.view is None else target.shown(displacement)
-    return Correspondence(kept, terraces, excess, shown)
+    return Correspondence(kept, target.terraces_along(normals), excess, shown)
 
 
 def _shrinkage(
@@ -114,12 +142,8 @@ def _bulge(surface: ObservedSurface, displacement: NDArray[np.float64]) -> NDArr
 
 def _model_to_image(
     target: SurfaceTarget, vertices: NDArray[np.float64], normals: NDArray[np.float64], held: Correspondence
-) -> tuple[NDArray[Any], ...]:
-    """Residuals of the deformed vertices (n_vertices, 3) mm with unit normals (n_vertices, 3).
-
-    As `Residuals` has them: values, weights, places, normals, material places (n, ...). Then the vertices (n, 3) of the
-    triangle of each, and the derivatives (n, 3 corners, 3 axes) by their motion.
-    """
+) -> _Direction:
+    """Of the deformed vertices (n_vertices, 3) mm with unit normals (n_vertices, 3)."""
     barycentric, area = held.of_model(target.barycentric), held.of_model(target.area)
     corners = target.surface.triangles[held.of_model(target.triangle)]
     material, places = (places_within(of[corners], barycentric) for of in (target.surface.rest, vertices))
@@ -130,29 +154,29 @@ def _model_to_image(
     by_corners = barycentric[:, :, None] * (slope[:, None] * normal)[:, None]
     values = distance - held.of_model(target.rest_distance) - excess
     weights = 0.5 * area / max(float(area.sum()), 1e-30)
-    return values, weights, places, normal, material, corners, by_corners
+    return _Direction(values, weights, places, normal, material, corners, by_corners)
 
 
 def _image_to_model(
     target: SurfaceTarget, vertices: NDArray[np.float64], normals: NDArray[np.float64], held: Correspondence
-) -> tuple[NDArray[Any], ...]:
-    """As `_model_to_image`, of the image's points."""
+) -> _Direction:
+    """Of the deformed vertices (n_vertices, 3) mm with unit normals (n_vertices, 3)."""
     surface, kept = target.surface, held.kept
     image = target.image_points[kept]
-    triangle, barycentric, places = _closest(surface, vertices, image)
-    corners = surface.triangles[triangle]
-    offset = places - image
+    closest = _closest(surface, vertices, image)
+    corners = surface.triangles[closest.triangle]
+    offset = closest.places - image
     plane = triangle_normals(vertices, surface.triangles)
-    plane = (plane / np.maximum(_length(plane), 1e-30)[:, None])[triangle]
+    plane = (plane / np.maximum(_length(plane), 1e-30)[:, None])[closest.triangle]
     length = _length(offset)
     side = np.where(np.einsum("na,na->n", offset, plane) < 0.0, -1.0, 1.0)
-    material = places_within(surface.rest[corners], barycentric)
-    excess = np.einsum("nk,nk->n", barycentric, held.excess[corners])
-    normal = _within(normals, corners, barycentric)
-    by_corners = barycentric[:, :, None] * normal[:, None]
+    material = places_within(surface.rest[corners], closest.barycentric)
+    excess = np.einsum("nk,nk->n", closest.barycentric, held.excess[corners])
+    normal = _within(normals, corners, closest.barycentric)
+    by_corners = closest.barycentric[:, :, None] * normal[:, None]
     weights = 0.5 * target.image_area[kept] / max(target.image_area[kept].sum(), 1e-30)
     values = side * length - (target.before.at(material) - target.level) - excess
-    return values, weights, places, normal, material, corners, by_corners
+    return _Direction(values, weights, closest.places, normal, material, corners, by_corners)
 
 
 def _within(
@@ -168,10 +192,7 @@ def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(np.einsum("na,na->n", vectors, vectors)))
 
 
-def _closest(
-    surface: ObservedSurface, vertices: NDArray[np.float64], image: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Points of the deformed surface closest to the image's: triangle (n,), barycentric (n, 3), places (n, 3) mm."""
+def _closest(surface: ObservedSurface, vertices: NDArray[np.float64], image: NDArray[np.float64]) -> _Closest:
     triangles = np.ascontiguousarray(surface.triangles)
     _, triangle, places = igl.point_mesh_squared_distance(np.ascontiguousarray(image), vertices, triangles)[:3]
     corner = vertices[triangles[triangle]]
@@ -184,4 +205,4 @@ def _closest(
     barycentric = np.clip(barycentric, 0.0, 1.0)
     barycentric[barycentric < ON_EDGE] = 0.0
     barycentric /= barycentric.sum(axis=1, keepdims=True)
-    return np.asarray(triangle, dtype=np.int64), barycentric, np.asarray(places)
+    return _Closest(np.asarray(triangle, dtype=np.int64), barycentric, np.asarray(places))

@@ -51,6 +51,14 @@ class SurfaceTarget:
         corners = (self.surface.rest + displacement)[self.surface.triangles[self.triangle]]
         return self.view.shows(places_within(corners, self.barycentric))
 
+    def terraces_along(self, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coherent rounding noise (n,) mm^4 of the voxels at places with unit normals (n, 3) of a smooth surface.
+
+        The image's own normals would not do: they are noisy with the same rounding, and weights that go with the
+        errors of what they weigh bias it.
+        """
+        return np.zeros(len(normals)) if self.voxels is None else terrace_noise(*self.voxels, normals)
+
 
 def surface_target(
     surface: ObservedSurface, before: DistanceMap, after: DistanceMap, view: FieldOfView | None = None

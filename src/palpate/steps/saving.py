@@ -96,10 +96,10 @@ def has_study(folder: Path) -> bool:
 def save_document(staging: Staging, name: str, document: dict[str, Any]) -> None:
     """Put the staged files in place with the document that lists them; those of the document before it go with that."""
     document["files"] = staging.digests()
-    retired, aside, warnings = earlier_files(staging.folder, name, document["files"])
-    document["warnings"] = warning_rows(warnings, beside=document["warnings"])
+    earlier = earlier_files(staging.folder, name, document["files"])
+    document["warnings"] = warning_rows(earlier.warnings, beside=document["warnings"])
     write_json(staging.area / name, document)
-    staging.commit(retired=retired, aside=aside)
+    staging.commit(retired=earlier.retired, aside=earlier.aside)
 
 
 def _commit_estimate(staging: Staging, case: Case, document: dict[str, Any]) -> None:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -81,14 +82,22 @@ def _says(path: Path, case: Case) -> bool:
     return case_tables(found, place) == case_tables(case, place)
 
 
-def earlier_files(
-    folder: Path, document: str, files: Digests
-) -> tuple[tuple[str, ...], tuple[str, ...], tuple[Finding, ...]]:
+@dataclass(frozen=True, slots=True)
+class Earlier:
+    """Files of earlier runs: `retired` leave with the document that lists them, `aside` get another name.
+
+    warnings: on what stays and could be taken for a file of the new run, or lists a file that the new run replaces.
+    """
+
+    retired: tuple[str, ...]
+    aside: tuple[str, ...]
+    warnings: tuple[Finding, ...]
+
+
+def earlier_files(folder: Path, document: str, files: Digests) -> Earlier:
     """What becomes of the files in `folder` when a run's `document` with its `files` takes its place there.
 
-    Those that leave with the document that lists them; those that are set aside under another name, as a page that no
-    file vouches for, which would be read as that of the new result; and warnings on what stays and could be taken for a
-    file of the new run, or lists a file that the new run replaces.
+    A page that no file vouches for is set aside: it would be read as that of the new result.
     """
     others = {other: _listed(folder, other) for other in DOCUMENTS if other != document}
     shared = {name for listed in others.values() for name in listed}
@@ -108,7 +117,7 @@ def earlier_files(
         if replaced:
             words = f"tells of an earlier run, whose {', '.join(replaced)} this run has replaced"
             warnings.append(_warning(f"{other} in the output folder {words}"))
-    return retired, aside, tuple(warnings)
+    return Earlier(retired, aside, tuple(warnings))
 
 
 def seal_of(document: Mapping[str, Any]) -> str:
