@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from palpate.cohort.engines import dask
 from palpate.cohort.engines.dask import DaskEngine, attempt_on_worker
 from palpate.cohort.task import Limits, Outcome, Row, Task
 from palpate.errors import ResourceError
@@ -65,9 +64,9 @@ class Client:
 def outcomes(put_library):
     """The outcomes of tasks on the workers of a client, by a scheduler whose address is never asked."""
 
-    def of(client, tasks):
+    def of(client, tasks, **options):
         put_library("distributed", SimpleNamespace(Client=lambda *_, **__: nullcontext(client)))
-        return list(DaskEngine("tcp://here:1", work="a:b").outcomes(tasks))
+        return list(DaskEngine("tcp://here:1", work="a:b", **options).outcomes(tasks))
 
     return of
 
@@ -113,9 +112,8 @@ def test_a_scheduler_that_is_gone_ends_the_run(tmp_path, outcomes):
         outcomes(Client(mortal=0), tasks(tmp_path, "cut off"))
 
 
-def test_without_workers_rows_wait(tmp_path, outcomes, monkeypatch):
-    monkeypatch.setattr(dask, "PATIENCE_S", 0.02)
+def test_without_workers_rows_wait(tmp_path, outcomes):
     client = Client(mortal=0)
     client.workers.clear()
     with pytest.raises(ResourceError, match="no worker"):
-        outcomes(client, tasks(tmp_path, "a"))
+        outcomes(client, tasks(tmp_path, "a"), patience_s=0.02)

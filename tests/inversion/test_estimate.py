@@ -12,6 +12,8 @@ from palpate.inversion import (
     Bounds,
     InversionSettings,
     Objective,
+    Outcome,
+    StartRun,
     begun,
     estimate,
     fit_driver,
@@ -19,6 +21,8 @@ from palpate.inversion import (
     minimised,
     posterior_sd,
 )
+from palpate.inversion.candidates import compared, concluded
+from palpate.inversion.trust_region import NEAR
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
 from palpate.uncertainty import FittedState, sandwich_covariance
@@ -174,59 +178,44 @@ def test_a_second_kind_of_observation_is_stated_with_its_fit(twins, twin, with_a
 def iterate(twins, twin, voxels):
     """The end of a loop near the truth, on a reduced basis."""
     start = begun(twins.objective_of(voxels, twin.coefficients), twin.unknowns)
-    end = minimised(start, twins.settings(1.0).bounds, estimate.NEAR, progress=twins.silent, title="")
+    end = minimised(start, twins.settings(1.0).bounds, NEAR, progress=twins.silent, title="")
     assert end.minimum.converged
     return end
 
 
-def worse(twins, iterate, by):
-    """A minimum elsewhere, where another objective has one: gland and sac held apart from where they fit."""
-    theta = iterate.minimum.unknowns[:2] + by
-    held = Bounds(theta - 1e-3, theta + 1e-3)
-    start = begun(iterate.objective, np.concatenate([theta, iterate.minimum.unknowns[2:]]))
-    end = minimised(start, held, estimate.NEAR, progress=twins.silent, title="")
-    return replace(end, minimum=replace(end.minimum, outcome=estimate.Outcome.CONVERGED))
+@pytest.fixture(scope="module")
+def worse(twins, twin, iterate):
+    """A minimum elsewhere: that of coarser images of a body twice as stiff, whose noise is larger."""
+    other = twins.deformed(twin.model, voxel_mm=2.0, truth=twins.TRUTH + 0.7)
+    start = begun(twins.objective_of(twins.voxel_problem(other), other.coefficients), other.unknowns)
+    end = minimised(start, twins.settings(1.0).bounds, NEAR, progress=twins.silent, title="")
+    assert end.minimum.converged
+    assert end.objective.observations[0].weighting.sd > iterate.objective.observations[0].weighting.sd
+    return end
 
 
-def concluded(twins, *iterates):
-    starts = tuple(estimate.StartRun(np.zeros(2), it.minimum, i) for i, it in enumerate(iterates))
+def together(twins, *iterates):
+    starts = tuple(StartRun(np.zeros(2), it.minimum, i) for i, it in enumerate(iterates))
     bounds = twins.settings(1.0).bounds
-    return estimate._concluded(iterates, starts, iterates[0].minimum.evaluation, bounds, 0)
-
-
-def hold(monkeypatch):
-    """Minima stay where they are when they are compared: the objective has no second one there."""
-    follow = estimate.minimised
-
-    def here(start, bounds, rule, **named):
-        return follow(start, bounds, rule, fixed=True, **named)
-
-    monkeypatch.setattr(estimate, "minimised", here)
+    return concluded(iterates, starts, iterates[0].minimum.evaluation, bounds, 0)
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_the_worse_fit_does_not_win_because_its_noise_is_larger(twins, iterate, order, monkeypatch):
+def test_the_worse_fit_does_not_win_because_its_noise_is_larger(twins, iterate, worse, order):
     """What a larger noise takes off its misfit it pays for by ln Z, whichever was sought first."""
-    far = worse(twins, iterate, 0.7)
-    assert far.objective.observations[0].weighting.sd > iterate.objective.observations[0].weighting.sd
-    hold(monkeypatch)
-    found = concluded(twins, *(iterate, far)[::order])
+    found = together(twins, *(iterate, worse)[::order])
     assert found.minimum.unknowns == pytest.approx(iterate.minimum.unknowns)
     assert found.candidates[found.best].value < found.candidates[1 - found.best].value
 
 
-def test_minima_are_compared_with_the_same_numbers_of_residuals(twins, iterate, monkeypatch):
+def test_minima_are_compared_with_the_same_numbers_of_residuals(twins, iterate, worse):
     """More of them make every value another one: two that differ in that alone are equal."""
     noise = NoiseModel(np.array([0.2**2]), np.array([1.0]))
     seen = [o.with_correlation(noise) for o in iterate.objective.observations]
     other = replace(iterate, objective=iterate.objective.with_observations(seen))
-    away = iterate.minimum.unknowns + np.append([0.7, 0.7], np.zeros(12))
-    hold(monkeypatch)
-    values, _ = estimate._values([iterate, other], twins.settings(1.0).bounds)
+    values, _ = compared([iterate, other, worse], twins.settings(1.0).bounds)
     assert values[1] == pytest.approx(values[0], abs=0.02)
-    apart = replace(other, minimum=replace(other.minimum, unknowns=away))
-    values, _ = estimate._values([iterate, apart], twins.settings(1.0).bounds)
-    assert values[1] > values[0] + 2.0
+    assert values[2] > values[0] + 2.0
 
 
 @pytest.mark.parametrize("ratios", [(1.0,), (0.3, 2.0, 8.0)])
@@ -247,23 +236,21 @@ def test_every_evaluation_of_the_objective_is_counted(twins, voxels, ratios, mon
 def test_iterates_that_met_are_one_candidate_of_which_the_one_sought_first_stands(twins, iterate):
     minimum = iterate.minimum
     near = replace(minimum, unknowns=minimum.unknowns + np.append([0.01, -0.01], np.zeros(len(minimum.unknowns) - 2)))
-    found = concluded(twins, iterate, replace(iterate, minimum=near))
+    found = together(twins, iterate, replace(iterate, minimum=near))
     assert len(found.candidates) == 1
     assert [start.candidate for start in found.starts] == [0, 0]
     assert found.minimum is minimum
 
 
-def test_minima_further_apart_than_their_own_uncertainty_are_candidates_of_their_own(twins, iterate, monkeypatch):
-    hold(monkeypatch)
-    found = concluded(twins, iterate, worse(twins, iterate, 0.7))
+def test_minima_further_apart_than_their_own_uncertainty_are_candidates_of_their_own(twins, iterate, worse):
+    found = together(twins, iterate, worse)
     assert len(found.candidates) == 2
     assert [start.candidate for start in found.starts] == [0, 1]
 
 
-def test_a_minimum_that_did_not_converge_is_not_the_best_one_while_another_did(twins, iterate, monkeypatch):
-    hold(monkeypatch)
-    failed = replace(iterate, minimum=replace(iterate.minimum, outcome=estimate.Outcome.STUCK))
-    found = concluded(twins, failed, worse(twins, iterate, 0.7))
+def test_a_minimum_that_did_not_converge_is_not_the_best_one_while_another_did(twins, iterate, worse):
+    failed = replace(iterate, minimum=replace(iterate.minimum, outcome=Outcome.STUCK))
+    found = together(twins, failed, worse)
     assert found.best == 1
     assert found.minimum.converged
 

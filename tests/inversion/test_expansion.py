@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 
 import numpy as np
@@ -11,7 +11,9 @@ import pytest
 from palpate.approximation import expansion
 from palpate.errors import EstimationError, NotConverged, SolverError
 from palpate.inversion import Outcome, continue_at_finite_strain, estimate, invert
-from palpate.mechanics.finite_strain import finite_strain_model
+from palpate.inversion.candidates import Candidate
+from palpate.inversion.trust_region import NEAR
+from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
 from palpate.mechanics.laws.registry import law_named
 
 
@@ -37,9 +39,28 @@ def settings(twins):
 @pytest.fixture(scope="module")
 def linear(twins, body, settings):
     """What the finite-strain law is begun from."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(estimate, "continue_at_finite_strain", lambda found, *_, **__: found)
-        return invert(body[1], settings, progress=twins.silent)
+    _, problem, model = body
+    found = invert(problem.linear(), settings, progress=twins.silent, rule=NEAR)
+    candidates = [replace(candidate, iterate=under(model, candidate.iterate)) for candidate in found.candidates]
+    return replace(found, candidates=tuple(candidates))
+
+
+def under(model, iterate):
+    """A linear minimum whose state has that finite-strain model."""
+    states = tuple(replace(state, finite_strain=model) for state in iterate.objective.states)
+    return replace(iterate, objective=replace(iterate.objective, states=states))
+
+
+def failing(model, error):
+    """A finite-strain model that has no equilibrium anywhere, for that reason."""
+
+    class Failing(FiniteStrainModel):
+        def attempt(self, *_, **__):
+            raise error
+
+        solve = attempt
+
+    return Failing(*(getattr(model, field.name) for field in fields(model)))
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +70,8 @@ def ended(twins, linear, settings):
     @cache
     def with_few(few):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(expansion, "FEW", few)
+            around = estimate.expansion_around
+            patch.setattr(estimate, "expansion_around", lambda *of, **named: replace(around(*of, **named), few=few))
             return continue_at_finite_strain(linear, settings, progress=twins.silent)
 
     return with_few
@@ -87,16 +109,14 @@ def test_the_derivatives_that_decide_the_moduli_are_those_of_the_equilibrium(bod
 
 def test_all_derivatives_are_those_of_the_equilibrium_where_they_are_few(ended):
     """By the directions that decide alone columns of elsewhere remain."""
-    found, few, missed = ended(0), expansion.FEW, []
-    with pytest.MonkeyPatch.context() as patch:
-        unknowns = found.minimum.unknowns + np.array([0.3, -0.2, *np.full(len(found.minimum.unknowns) - 2, 0.1)])
-        evaluation = found.objective(unknowns)
-        for number in (0, few):
-            patch.setattr(expansion, "FEW", number)
-            (place,) = found.objective.linearisation_points(unknowns, evaluation)
-            there = found.objective.states[0].approximation.update(place)
-            exact = there.equilibrium.tangent()
-            missed.append(np.linalg.norm(there.model.derivatives - exact) / np.linalg.norm(exact))
+    found, missed = ended(0), []
+    unknowns = found.minimum.unknowns + np.array([0.3, -0.2, *np.full(len(found.minimum.unknowns) - 2, 0.1)])
+    evaluation = found.objective(unknowns)
+    for few in (0, expansion.FEW):
+        (place,) = found.objective.linearisation_points(unknowns, evaluation)
+        there = replace(found.objective.states[0].approximation, few=few).update(place)
+        exact = there.equilibrium.tangent()
+        missed.append(np.linalg.norm(there.model.derivatives - exact) / np.linalg.norm(exact))
     assert missed[1] < 0.02  # of what they lack a hundredth is left, see `tangent_along`
     assert missed[0] > 3.0 * missed[1]
 
@@ -127,13 +147,11 @@ def test_what_both_laws_cost_is_counted(linear, continued):
     assert continued.evaluations > linear.evaluations
 
 
-def test_a_motion_without_equilibrium_ends_the_estimate_where_it_is_the_best_one(twins, linear, settings, monkeypatch):
-    def lost(*_):
-        raise NotConverged("folded")
-
-    monkeypatch.setattr(estimate, "_coarse", lost)
+def test_a_motion_without_equilibrium_ends_the_estimate_where_it_is_the_best_one(twins, body, linear, settings):
+    best = linear.candidates[linear.best]
+    lost = replace(best, iterate=under(failing(body[2], NotConverged("folded")), best.iterate))
     with pytest.raises(NotConverged, match="folded"):
-        continue_at_finite_strain(linear, settings, progress=twins.silent)
+        continue_at_finite_strain(replace(linear, candidates=(lost,)), settings, progress=twins.silent)
 
 
 FAILURES = {
@@ -143,24 +161,16 @@ FAILURES = {
 }
 
 
-def test_secondary_minima_that_fail_do_not_end_a_good_estimate(twins, linear, settings, monkeypatch):
+def test_secondary_minima_that_fail_do_not_end_a_good_estimate(twins, body, linear, settings):
     """They are left out of the comparison, though their linear value is the smaller one, and it is said why."""
     first = linear.candidates[0]
     rest = np.zeros(len(first.minimum.unknowns) - 1)
-    elsewhere = [
-        replace(first.iterate, minimum=replace(first.minimum, unknowns=first.minimum.unknowns + np.append(by, rest)))
-        for by in (1.0, 2.0, -1.0)
-    ]
-    others = tuple(estimate.Candidate(iterate, first.value - 100.0) for iterate in elsewhere)
+    others = []
+    for by, error in zip((1.0, 2.0, -1.0), FAILURES, strict=True):
+        away = replace(first.minimum, unknowns=first.minimum.unknowns + np.append(by, rest))
+        iterate = under(failing(body[2], error), replace(first.iterate, minimum=away))
+        others.append(Candidate(iterate, first.value - 100.0))
     starts = (linear.starts[0], *(replace(linear.starts[1], candidate=k) for k in (1, 2, 3)))
-    whole, failing = estimate._coarse, dict(zip(map(id, elsewhere), FAILURES, strict=True))
-
-    def only_the_best(iterate):
-        if id(iterate) in failing:
-            raise failing[id(iterate)]
-        return whole(iterate)
-
-    monkeypatch.setattr(estimate, "_coarse", only_the_best)
     said = list[str]()
     several = replace(linear, candidates=(first, *others), starts=starts)
     found = continue_at_finite_strain(several, settings, progress=said.append)
@@ -177,7 +187,7 @@ def test_starts_that_merge_under_the_law_of_the_case_are_one_candidate(twins, li
     away = first.minimum.unknowns + np.append(0.2, np.zeros(len(first.minimum.unknowns) - 1))
     elsewhere = replace(first.iterate, minimum=replace(first.minimum, unknowns=away))
     starts = (linear.starts[0], replace(linear.starts[1], candidate=1))
-    both = replace(linear, candidates=(first, estimate.Candidate(elsewhere, first.value + 1.0)), starts=starts)
+    both = replace(linear, candidates=(first, Candidate(elsewhere, first.value + 1.0)), starts=starts)
     found = continue_at_finite_strain(both, settings, progress=twins.silent)
     assert len(found.candidates) == 1
     assert [start.candidate for start in found.starts] == [0, 0]

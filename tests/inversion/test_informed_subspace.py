@@ -51,7 +51,7 @@ def test_what_is_left_out_could_explain_less_than_it_may(rng):
     n = 40
     covariance, information = spread(rng, n), 40.0 * spread(rng, n)
     block = Block("a", "b", Acts.BOUNDARY, (0,), np.linalg.inv(covariance))
-    basis, inverse = informed._informed(block, information)
+    basis, inverse = informed.informed_combinations(block, information)
     assert basis.shape[1] < n
     assert inverse @ basis == pytest.approx(np.eye(basis.shape[1]), abs=1e-9)
     left = np.eye(n) - basis @ inverse
@@ -68,7 +68,7 @@ def test_a_block_of_few_unknowns_offsets_and_poissons_ratios_stay_as_they_are():
     drawn = Block("a", "b", Acts.RESIDUALS, (0,), np.eye(informed.SMALL + 1))
     ratios = Block("all", "poisson", Acts.MATERIAL, (0,), np.eye(informed.SMALL + 1))
     for block in (few, drawn, ratios):
-        basis, inverse = informed._informed(block, np.zeros((block.size, block.size)))
+        basis, inverse = informed.informed_combinations(block, np.zeros((block.size, block.size)))
         assert np.array_equal(basis, np.eye(block.size))
         assert np.array_equal(inverse, np.eye(block.size))
 

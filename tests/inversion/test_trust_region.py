@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
-from palpate.approximation import LinearisationPoint, exact_approximation, reduced_basis
+from palpate.approximation import LinearisationPoint, ReducedBasis, exact_approximation, reduced_basis
 from palpate.approximation.contract import ModelError
 from palpate.errors import NotConverged
 from palpate.inversion import (
@@ -181,26 +181,40 @@ def test_a_step_that_raises_the_objective_is_refused_and_a_shorter_one_taken(twi
     assert len(refused) == TRIALS
 
 
-def test_a_trial_without_equilibrium_is_refused_and_its_reason_told_where_there_is_no_other(
-    twins, twin, voxels, monkeypatch
-):
-    start = begun(twins.objective_of(voxels, twin.coefficients), np.append([0.0, 0.0], twin.coefficients))
-    evaluated, failures = trust_region._evaluated, []
+def unfollowed(basis, times):
+    """A reduced basis that cannot say what it misses, and that cannot be made exact so many times."""
+    failures = list[int]()
 
-    def folded(*of):
-        if len(failures) < 2:
-            failures.append(1)
-            raise NotConverged("folded")
-        return evaluated(*of)
+    class Unfollowed(ReducedBasis):
+        def error(self, _at):
+            return ModelError(np.inf, np.zeros(0))
 
-    bounds, one = twins.settings(1.0).bounds, replace(CHEAP, iterations=1)
-    monkeypatch.setattr(trust_region, "_evaluated", folded)
-    end = minimised(start, bounds, one, progress=twins.silent, title="")
-    assert end.totals
-    failures.clear()
-    monkeypatch.setattr(trust_region, "TRIALS", 2)
+        def update(self, at):
+            if len(failures) < times:
+                failures.append(1)
+                raise NotConverged("folded")
+            return super().update(at)
+
+    return Unfollowed(*(getattr(basis, field.name) for field in fields(basis)))
+
+
+@pytest.fixture(scope="module")
+def reduced(twins, twin, voxels):
+    """Where a loop begins, on a reduced basis."""
+    return begun(twins.objective_of(voxels, twin.coefficients), np.append([0.0, 0.0], twin.coefficients))
+
+
+def test_a_trial_without_equilibrium_is_refused_and_its_reason_told_where_there_is_no_other(twins, reduced):
+    bounds, one = twins.settings(1.0).bounds, StopRule(iterations=1)
+    (basis,) = reduced.objective.approximations
+
+    def end(times):
+        start = replace(reduced, objective=reduced.objective.under([unfollowed(basis, times)]))
+        return minimised(start, bounds, one, progress=twins.silent, title="")
+
+    assert end(times=2).totals
     with pytest.raises(NotConverged, match="folded"):
-        minimised(start, bounds, one, progress=twins.silent, title="")
+        end(times=TRIALS)
 
 
 def test_the_history_is_that_of_the_loop_alone_and_begins_where_the_first_start_ended(found):
@@ -257,12 +271,9 @@ def test_what_an_approximation_misses_is_told_by_how_far_it_sets_the_moduli_off(
     assert off == pytest.approx(true, abs=0.1 * true.max())
 
 
-def test_an_approximation_that_cannot_say_what_it_misses_leaves_everything_open(twins, twin, voxels, monkeypatch):
-    basis = reduced_basis(twin.model, twin.moduli)
-    start = begun(twins.objective_of(voxels, twin.coefficients).under([basis]), twin.unknowns)
-    silent = ModelError(np.inf, np.zeros(0))
-    monkeypatch.setattr(type(basis), "error", lambda _self, _at: silent)
-    error, off, _ = trust_region.model_error(start.objective, start.minimum)
+def test_an_approximation_that_cannot_say_what_it_misses_leaves_everything_open(reduced):
+    (basis,) = reduced.objective.approximations
+    error, off, _ = trust_region.model_error(reduced.objective.under([unfollowed(basis, 0)]), reduced.minimum)
     assert error == np.inf
     assert off.tolist() == [np.inf, np.inf]
 
@@ -275,7 +286,7 @@ def test_derivatives_that_are_exact_nowhere_leave_everything_open(found):
     )
 
     def left(place):
-        return trust_region._linearisation(found.objective.under([replace(basis, place=place)]), minimum)
+        return trust_region.linearisation_error(found.objective.under([replace(basis, place=place)]), minimum)
 
     assert np.all(left(None) == np.inf)
     assert np.all(left(replace(here, directions=None)) == np.inf)

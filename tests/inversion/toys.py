@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -48,6 +48,21 @@ class Folding:
         if unknowns[-1] > self.most:
             raise SolverError("the motion turns elements inside out")
         return self.of(unknowns)
+
+
+@dataclass(frozen=True)
+class Uphill:
+    """Another objective with the wrong sign of its score: what seeks its minimum stays where it begins."""
+
+    of: object
+
+    @property
+    def n_parameters(self):
+        return self.of.n_parameters
+
+    def __call__(self, unknowns):
+        there = self.of(unknowns)
+        return replace(there, score=-there.score)
 
 
 @dataclass(frozen=True)

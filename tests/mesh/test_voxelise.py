@@ -8,7 +8,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
-from palpate.mesh.voxelise import voxelise
+from palpate.mesh.voxelise import BRICK, voxelise
 
 TISSUES = (
     Tissue("ball", Role.ESTIMATE, (1,)),
@@ -111,17 +111,27 @@ def test_touching_regions_leave_no_gap_and_no_overlap_even_on_voxel_centres():
 
 
 @pytest.mark.parametrize("spacing", [0.5, 2.3])
-def test_what_bricks_decide_is_what_each_voxel_would_in_holes_and_outside_of_the_mesh(monkeypatch, spacing):
+def test_a_voxel_has_the_same_tissue_in_whatever_brick_it_lies_in_holes_and_outside_of_the_mesh(spacing):
+    """An image that begins some voxels further on has its bricks elsewhere; one voxel thin it has none to speak of."""
     space = lagrange_space(ball_and_cavity(), "P2")
     affine = np.array([[0.96, -0.28, 0.0], [0.28, 0.96, 0.0], [0.0, 0.0, 1.0]]) @ np.diag(
         [spacing, spacing, 1.4 * spacing]
     )
     wide = VoxelGrid((47, 41, 29), np.block([[affine, np.full((3, 1), -12.0)], [np.zeros((1, 3)), 1.0]]))
     bricks = voxelise(space, wave(space.points), wide)
-    monkeypatch.setattr("palpate.mesh.voxelise.BRICK", 1)
-    each = voxelise(space, wave(space.points), wide)
-    assert {1, 2} <= set(np.unique(each))
-    assert np.array_equal(bricks, each)
+    assert {1, 2} <= set(np.unique(bricks))
+
+    def part(*of: slice) -> VoxelGrid:
+        """The grid of some of the voxels."""
+        start = np.array([each.start or 0 for each in of])
+        origin = wide.affine[:3, :3] @ start + wide.affine[:3, 3]
+        affine = np.block([[wide.affine[:3, :3], origin[:, None]], [np.array([[0.0, 0.0, 0.0, 1.0]])]])
+        shape = tuple(len(range(n)[each]) for n, each in zip(wide.shape, of, strict=True))
+        return VoxelGrid(shape, affine)
+
+    slabs = [(slice(k, k + 1), slice(None), slice(None)) for k in (13, 21)]
+    for of in [tuple(slice(BRICK - k, None) for k in order) for order in ((1, 2, 3), (3, 1, 2), (2, 3, 1))] + slabs:
+        assert np.array_equal(voxelise(space, wave(space.points), part(*of)), bricks[of])
 
 
 def test_any_orientation_of_the_voxel_axes_gives_the_same_tissues():

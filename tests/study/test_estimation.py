@@ -10,7 +10,7 @@ import pytest
 from palpate.errors import NotConverged
 from palpate.images.tissue import Role
 from palpate.inversion import Inversion, Outcome, OuterIterate, frozen_posterior, gauss_newton, invert
-from palpate.inversion.estimate import Candidate
+from palpate.inversion.candidates import Candidate
 from palpate.inversion.trust_region import Convergence
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel

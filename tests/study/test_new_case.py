@@ -17,7 +17,7 @@ from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image, write_label_image
 from palpate.images.tissue import Role
 from palpate.images.totalsegmentator import CLASSES
-from palpate.study import check, cost
+from palpate.study import check
 from palpate.study.case_file import read_case
 from palpate.study.cost import expected_cost
 from palpate.study.guess import class_names, guess_tissues
@@ -231,9 +231,8 @@ def test_a_background_without_a_body_is_no_air():
     assert guess_tissues(LabelImage(array, GRID, {0: "air", **NAMES}))[-1].role is Role.VOID
 
 
-def test_the_proposed_mesh_fits_the_memory_of_the_machine(folder, monkeypatch, environment):
+def test_the_proposed_mesh_fits_the_memory_of_the_machine(folder, environment):
     has_gb = 1.0
-    monkeypatch.setattr(cost, "LATTICE", 24)
     images = CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json")
 
     def edge_and_memory(text):

@@ -238,16 +238,15 @@ def test_finer_voxels_leave_less_to_the_place_of_the_grid(twins, twin, imaged):
     assert 0.0 < spread[1] < 0.7 * spread[0]
 
 
-def test_the_image_around_the_surfaces_errs_there_as_the_whole_one(twins, twin, imaged, monkeypatch):
+def test_the_image_around_the_surfaces_errs_there_as_the_whole_one(twins, twin, imaged):
     objective, evaluation = imaged
     states = (fitted(twins, twin, 1.5),)
 
-    def errors():
-        return np.concatenate(imaging_errors(objective, evaluation, states, rng=np.random.default_rng(4)))
+    def errors(**margin):
+        return np.concatenate(imaging_errors(objective, evaluation, states, rng=np.random.default_rng(4), **margin))
 
     near = errors()
-    monkeypatch.setattr("palpate.uncertainty.covariance.MARGIN_MM", 1e3)
-    assert near == pytest.approx(errors(), abs=1e-4)
+    assert near == pytest.approx(errors(margin_mm=1e3), abs=1e-4)
     assert np.std(near) > 0.01
 
 

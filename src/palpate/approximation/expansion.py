@@ -34,13 +34,14 @@ class Expansion:
     """u_0 + T [ln E - ln E_0, q - q_0] around an equilibrium; implements `Approximation`.
 
     derivatives_at (n_regions,) kPa: moduli where T was last made exact along the directions that decide; None: nowhere
-    yet, it is that of an earlier equilibrium.
+    yet, it is that of an earlier equilibrium. few: moduli and modes, up to which all derivatives are made exact.
     """
 
     model: FirstOrderModel
     equilibrium: FiniteStrainEquilibrium = field(repr=False)
     counts: SolveCounts
     derivatives_at: NDArray[np.float64] | None = None
+    few: int = FEW
 
     @property
     def constraint(self) -> Constraint:
@@ -78,7 +79,7 @@ class Expansion:
             if not found.converged:
                 raise NotConverged(f"no equilibrium near the estimate: {found.reason}")
             there = self._around(found)
-        few = there.model.n_regions + there.model.n_modes <= FEW
+        few = there.model.n_regions + there.model.n_modes <= there.few
         if at.directions is None or at.metric is None:
             return there
         directions = np.eye(len(at.directions)) if few else at.directions
@@ -111,7 +112,7 @@ class Expansion:
     def _around(self, there: FiniteStrainEquilibrium) -> Expansion:
         """The expansion around an equilibrium so near that its derivatives still hold there: a third of the price."""
         model = replace(self.model, moduli=there.moduli, coefficients=there.coefficients, values=there.values)
-        return Expansion(model, there, self.counts + there.counts, self.derivatives_at)
+        return replace(self, model=model, equilibrium=there, counts=self.counts + there.counts)
 
 
 def coarse_equilibrium(

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from palpate.approximation.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.errors import ConfigurationError, EstimationError, NotConverged
+from palpate.inversion.candidates import COMPARED, Inversion, StartRun, as_good, concluded, grouped, members
 from palpate.inversion.frozen_posterior import fixed_correspondence, frozen_posterior
 from palpate.inversion.hyper_parameters import with_first_noise
 from palpate.inversion.informed_subspace import informed_problem
 from palpate.inversion.later_state import InverseProblem, LaterState
-from palpate.inversion.objective import AS_GOOD, Evaluation, Objective
+from palpate.inversion.objective import AS_GOOD, Objective
 from palpate.inversion.optimise import (
     Bounds,
     Iterate,
@@ -24,16 +25,13 @@ from palpate.inversion.optimise import (
     gauss_newton,
     same_minimum,
 )
-from palpate.inversion.trust_region import Convergence, OuterIterate, StopRule, begun, minimised
+from palpate.inversion.trust_region import NEAR, OuterIterate, StopRule, begun, minimised
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
-from palpate.mechanics.forward import SolveCounts
 from palpate.parallel import blas_on_one_thread
-from palpate.progress import Progress, during, silent
+from palpate.progress import Progress, during
 
 REPORTED = StopRule()
-NEAR = StopRule(step_sd=0.2)  # of a start that is followed further, and of an interval: a tenth of its half-width
-COMPARED = replace(NEAR, correlate=False)  # the numbers of independent residuals stay: objectives are compared
 FOLLOWED = 2  # minima of starts beside the first one, the best
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
 
@@ -50,70 +48,6 @@ class InversionSettings:
     def every_start(self) -> tuple[NDArray[np.float64], ...]:
         """All starts (n_parameters,), the further ones last."""
         return self.starts + self.further
-
-
-@dataclass(frozen=True, slots=True)
-class StartRun:
-    """What one start did on the cheapest model: log-moduli (n_parameters,) where it began, and the minimum it found.
-
-    candidate: number of the minimum that it leads to, None where that was not followed, others being lower.
-    """
-
-    theta: NDArray[np.float64]
-    minimum: Minimum
-    candidate: int | None
-
-
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """A distinct minimum as it ended, and its value under the one objective under which all candidates are compared."""
-
-    iterate: OuterIterate
-    value: float
-
-    @property
-    def minimum(self) -> Minimum:
-        """The minimum under its own objective."""
-        return self.iterate.minimum
-
-
-@dataclass(frozen=True, slots=True)
-class Inversion:
-    """The distinct minima, the number of the best one, every start, and the evaluation at no motion (`rest`).
-
-    evaluations, counts: of everything that was followed to find and compare them, not of the best one alone.
-    """
-
-    candidates: tuple[Candidate, ...]
-    best: int
-    starts: tuple[StartRun, ...]
-    rest: Evaluation
-    evaluations: int
-    counts: SolveCounts
-
-    @property
-    def objective(self) -> Objective:
-        """The objective of the best minimum, with its approximations and noise models."""
-        return self.candidates[self.best].iterate.objective
-
-    @property
-    def minimum(self) -> Minimum:
-        """The best minimum; its history is that of the outer loop that all of its starts share."""
-        return self.candidates[self.best].minimum
-
-    @property
-    def convergence(self) -> Convergence:
-        """What the best minimum's last outer iteration left open."""
-        return self.candidates[self.best].iterate.convergence
-
-
-def as_good(value: float, best: float, *, scale: float = 1.0) -> bool:
-    """Whether a minimum with a `value` of minus the log-posterior cannot be told from one with the value `best`.
-
-    By the rule of a 95 % interval: twice their difference, times a `scale` of the deviance (see `Profile`), is below
-    1.96^2. What a value is worth does not depend on how many residuals make it up.
-    """
-    return scale * (value - best) < AS_GOOD
 
 
 @blas_on_one_thread()
@@ -193,7 +127,7 @@ def continue_at_finite_strain(
             outcome = Outcome.NO_EQUILIBRIUM if isinstance(error, NotConverged) else Outcome.NOT_FOLLOWED
             ends[number] = replace(ends[linear.best], minimum=replace(minimum, outcome=outcome))
     ended = [ends[number] for number in sorted(ends)]
-    found = _concluded(ended, linear.starts, linear.rest, settings.bounds, linear.best)
+    found = concluded(ended, linear.starts, linear.rest, settings.bounds, linear.best)
     return replace(found, evaluations=found.evaluations + evaluations, counts=spent)
 
 
@@ -247,19 +181,19 @@ def _linear(
     rest = objective(still)
     first = minimised(begun(objective, begin), bounds, NEAR, progress=progress, title="the middle start")
     screened = _screened(first, settings, progress)
-    groups = _groups(screened, n)
+    groups = grouped(screened, n)
     ends, spent = [first], first.minimum.evaluations
     belongs = {groups[i]: 0 for i, m in enumerate(screened) if same_minimum(m.unknowns, first.minimum, n)}
-    others = [min(_members(groups, g), key=lambda i: screened[i].evaluation.value) for g in dict.fromkeys(groups)]
+    others = [min(members(groups, g), key=lambda i: screened[i].evaluation.value) for g in dict.fromkeys(groups)]
     others = sorted((i for i in others if groups[i] not in belongs), key=lambda i: screened[i].evaluation.value)
     for number in [i for i in others if screened[i].converged][:FOLLOWED]:
         start = begun(first.objective, screened[number].unknowns)
         end = minimised(start, bounds, COMPARED, progress=progress, title=f"start {number + 1}")
         belongs[groups[number]], spent = len(ends), spent + end.minimum.evaluations
         ends.append(end)
-    same = _groups([end.minimum for end in ends], n)
+    same = grouped([end.minimum for end in ends], n)
     totals = [e.objective.total(e.minimum.evaluation) if e.minimum.converged else np.inf for e in ends]
-    best = [min(_members(same, g), key=lambda i: totals[i]) for g in range(max(same) + 1)]
+    best = [min(members(same, g), key=lambda i: totals[i]) for g in range(max(same) + 1)]
     order = sorted(best, key=lambda i: totals[i])
     followed = list[OuterIterate]()
     for number in order:
@@ -276,11 +210,11 @@ def _linear(
         StartRun(theta, minimum, place[belongs[group]] if group in belongs else None)
         for theta, minimum, group in zip(settings.every_start, screened, groups, strict=True)
     )
-    concluded = _concluded(followed, starts, rest, bounds, 0)
+    found = concluded(followed, starts, rest, bounds, 0)
     of_first = followed[0].counts
     counts = sum((other.counts - of_first for other in followed[1:]), of_first)
-    evaluations += 1 + spent + concluded.evaluations
-    return replace(concluded, evaluations=evaluations, counts=counts)
+    evaluations += 1 + spent + found.evaluations
+    return replace(found, evaluations=evaluations, counts=counts)
 
 
 def _screened(first: OuterIterate, settings: InversionSettings, progress: Progress) -> list[Minimum]:
@@ -299,11 +233,6 @@ def _screened(first: OuterIterate, settings: InversionSettings, progress: Progre
         begin = np.concatenate([theta, at.unknowns[n:]])
         found.append(gauss_newton(cheap, begin, bounds=settings.bounds, tolerance=AS_GOOD / 200.0))
     return found
-
-
-def _members(groups: Sequence[int], group: int) -> list[int]:
-    """Numbers of those that belong to a group."""
-    return [i for i, of in enumerate(groups) if of == group]
 
 
 def _coarse(linear: OuterIterate) -> tuple[Objective, list[FiniteStrainEquilibrium]]:
@@ -341,55 +270,3 @@ def _at_equilibrium(end: OuterIterate, before: tuple[Iterate, ...]) -> OuterIter
     evaluation, spent = final(end.minimum.unknowns), end.minimum.evaluations + 1
     minimum = replace(end.minimum, evaluation=evaluation, evaluations=spent, history=before + end.minimum.history)
     return replace(end, objective=final, minimum=minimum)
-
-
-def _concluded(
-    followed: Sequence[OuterIterate],
-    starts: tuple[StartRun, ...],
-    rest: Evaluation,
-    bounds: Bounds,
-    first: int,
-) -> Inversion:
-    """The distinct ones of the iterates, compared with each other; `first`: the number of the one sought first."""
-    n = followed[0].objective.n_parameters
-    groups = _groups([iterate.minimum for iterate in followed], n)
-    distinct = []
-    for group in range(max(groups) + 1):  # stood for by the one sought first, else one that converged
-        members = _members(groups, group)
-        distinct.append(followed[min(members, key=lambda i: (i != first, not followed[i].minimum.converged, i))])
-    values, evaluations = _values(distinct, bounds)
-    candidates = tuple(Candidate(iterate, value) for iterate, value in zip(distinct, values, strict=True))
-    usable = [c.value if c.minimum.converged else np.inf for c in candidates]
-    best = int(np.argmin(usable)) if np.isfinite(usable).any() else groups[first]
-    joined = tuple(s if s.candidate is None else replace(s, candidate=groups[s.candidate]) for s in starts)
-    return Inversion(candidates, best, joined, rest, evaluations, SolveCounts())
-
-
-def _values(distinct: Sequence[OuterIterate], bounds: Bounds) -> tuple[list[float], int]:
-    """The objective at each iterate, hyper-parameters at their best, and what it cost in evaluations.
-
-    All with the numbers of independent residuals of the first that converged, which are data of an objective.
-    """
-    if len(distinct) == 1:
-        return [distinct[0].objective.total(distinct[0].minimum.evaluation)], 0
-    reference = next((iterate for iterate in distinct if iterate.minimum.converged), distinct[0]).objective
-    values, evaluations = [], 0
-    for iterate in distinct:
-        pairs = zip(iterate.objective.observations, reference.observations, strict=True)
-        same = iterate.objective.with_observations([o.with_correlation(r.noise_model) for o, r in pairs])
-        end = minimised(begun(same, iterate.minimum.unknowns), bounds, COMPARED, progress=silent, title="compared")
-        values.append(end.objective.total(end.minimum.evaluation))
-        evaluations += end.minimum.evaluations
-    return values, evaluations
-
-
-def _groups(minima: Sequence[Minimum], n_parameters: int) -> list[int]:
-    """Number of the distinct minimum that each one is, in their order."""
-    distinct: list[Minimum] = []
-    groups = []
-    for minimum in minima:
-        same = [i for i, other in enumerate(distinct) if same_minimum(minimum.unknowns, other, n_parameters)]
-        if not same:
-            distinct.append(minimum)
-        groups.append(same[0] if same else len(distinct) - 1)
-    return groups

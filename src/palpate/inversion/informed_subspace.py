@@ -69,7 +69,9 @@ def informed_problem(
     middle, evaluations = fitted.unknowns, fitted.evaluations + 1
     # with them go the derivatives of all that is seen by all unknowns, which are large
     del objective, states, state, fitted, evaluation
-    bases = [_informed(b, data[np.ix_(own, own)]) for b, own in zip(parameters.blocks, columns, strict=True)]
+    bases = [
+        informed_combinations(b, data[np.ix_(own, own)]) for b, own in zip(parameters.blocks, columns, strict=True)
+    ]
     blocks = tuple(b.combined(inverse) for b, (_, inverse) in zip(parameters.blocks, bases, strict=True))
     reduced, kept = list[LaterState](), list[ReducedBasis]()
     for s, state in enumerate(problem.states):
@@ -124,7 +126,9 @@ class _Responses:
         return basis.with_material(np.asarray(self.material @ material.astype(np.float32), dtype=np.float64))
 
 
-def _informed(block: Block, information: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def informed_combinations(
+    block: Block, information: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Combinations (n, k) of a block's unknowns that data of an information (n, n) see, and their inverse (k, n)."""
     ratios = block.acts is Acts.MATERIAL and not block.alternatives  # Poisson's, one of each tissue, are no field
     edges = block.variation is not None  # which are made of what data see and what they do not see alone

@@ -34,7 +34,7 @@ from palpate.progress import silent
 NOISE = 0.5  # of the objective: that of closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
 INNER = 1e-4  # of the objective: decrement of a minimum on linear residuals, and change by hyper-parameters, that end
 SETTLES = 6  # iterations, after which numbers of independent residuals stay, and the trust region no longer grows
-LEAST_SD = 0.03  # of ln E, see `_linearisation`
+LEAST_SD = 0.03  # of ln E, see `linearisation_error`
 
 
 class Criterion(StrEnum):
@@ -89,6 +89,9 @@ class StopRule:
         if np.isinf(self.step_sd):
             return np.full(n_parameters, np.inf)
         return np.maximum(self.step_sd * posterior_sd(minimum, n_parameters), self.floor)
+
+
+NEAR = StopRule(step_sd=0.2)  # of a start that is followed further, and of an interval: a tenth of its half-width
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,7 +300,7 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
         return replace(there, correlated=correlated), minimum.evaluation, spent
     _, off, cost = model_error(objective, minimum)
     missing = float(np.max(off / (rule.model_error * tolerance), initial=0.0))
-    left = float(np.max(_linearisation(objective, minimum) / tolerance, initial=0.0)) if rule.derivatives else 0.0
+    left = float(np.max(linearisation_error(objective, minimum) / tolerance, initial=0.0)) if rule.derivatives else 0.0
     checks, judged = now.checks + cost, minimum.evaluation
     if max(missing, left) >= 1.0:
         places = objective.linearisation_points(unknowns, minimum.evaluation)
@@ -308,7 +311,7 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
     return replace(there, correlated=correlated), judged, spent
 
 
-def _linearisation(objective: Objective, there: Minimum) -> NDArray[np.float64]:
+def linearisation_error(objective: Objective, there: Minimum) -> NDArray[np.float64]:
     """How far (n_parameters,), of ln E, derivatives that are exact elsewhere may set an estimate off.
 
     At a distance d of ln E they are off by a share d, and so is what the residuals pull with them, which is worth a

@@ -367,12 +367,17 @@ def shifts_by(evaluation: Evaluation, errors: GridErrors, n_parameters: int) -> 
 
 
 def imaging_errors(
-    objective: Objective, evaluation: Evaluation, states: tuple[FittedState, ...], *, rng: np.random.Generator
+    objective: Objective,
+    evaluation: Evaluation,
+    states: tuple[FittedState, ...],
+    *,
+    rng: np.random.Generator,
+    margin_mm: float = MARGIN_MM,
 ) -> list[NDArray[np.float64]]:
     """Errors (n,) mm of the residuals of each observation when the fitted model itself is imaged.
 
-    The model, at rest and deformed, is turned into voxels on grids shifted at random by up to half a voxel; later
-    states of one reference state have the same image of it.
+    The model, at rest and deformed, is turned into voxels on grids shifted at random by up to half a voxel, at least
+    within a margin of the residuals' places; later states of one reference state have the same image of it.
     """
     errors, rest = list[NDArray[np.float64]](), dict[int, Segmentation]()
     references = [state.reference for state in objective.states]
@@ -385,9 +390,11 @@ def imaging_errors(
             material = [
                 line.residuals.material for line in evaluation.linearisations if references[line.state] == reference
             ]
-            rest[reference] = _imaged(fitted.space, np.zeros_like(fitted.displacement), fitted.before, material, rng)
+            rest[reference] = _imaged(
+                fitted.space, np.zeros_like(fitted.displacement), fitted.before, material, margin_mm, rng
+            )
         places = [line.residuals.places for line in lines]
-        after = _imaged(fitted.space, fitted.displacement, fitted.after, places, rng)
+        after = _imaged(fitted.space, fitted.displacement, fitted.after, places, margin_mm, rng)
         for line in lines:
             seen, error = line.observation, np.zeros(len(line.weights))  # none of what no segmented image shows
             if isinstance(seen, Imaged):
@@ -401,10 +408,11 @@ def _imaged(
     displacement: NDArray[np.float64],
     grid: VoxelGrid,
     places: Sequence[NDArray[np.float64]],
+    margin_mm: float,
     rng: np.random.Generator,
 ) -> Segmentation:
     """The model's image around places (n, 3) mm; further away nobody looks at it."""
-    margin = max(MARGIN_MM, MARGIN_VOXELS * float(grid.spacing.max())) / float(grid.spacing.min())
+    margin = max(margin_mm, MARGIN_VOXELS * float(grid.spacing.max())) / float(grid.spacing.min())
     near = cropped(grid, window_of(grid.index(np.concatenate(places)), grid, margin=math.ceil(margin)))
     affine = np.array(near.affine)
     affine[:3, 3] += affine[:3, :3] @ rng.uniform(-0.5, 0.5, 3)

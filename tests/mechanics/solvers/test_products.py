@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from scipy import sparse
 
-from palpate.mechanics.solvers import conjugate_gradients
-from palpate.mechanics.solvers.conjugate_gradients import FEW, times
+from palpate.mechanics.solvers.conjugate_gradients import FEW, WORTH_THREADS, times
 
 
 @pytest.mark.parametrize("n_columns", [0, 1, 3, FEW - 1, FEW, FEW + 5])
@@ -21,11 +22,13 @@ def test_it_is_that_of_the_dense_matrix(n_columns, order):
     assert np.allclose(found, matrix.toarray() @ vectors, atol=1e-13)
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
-def test_threads_change_not_a_bit_of_it(threads, monkeypatch):
+@pytest.mark.parametrize("threads", ["1", "2", "3"])
+@pytest.mark.parametrize("n_columns", [FEW - 1, FEW])
+def test_threads_change_not_a_bit_of_it(threads, n_columns, environment):
+    environment(OMP_NUM_THREADS=threads)
     rng = np.random.default_rng(3)
-    matrix = sparse.csr_matrix(sparse.random_array((700, 600), density=0.2, rng=rng))
-    vectors = rng.standard_normal((600, FEW))
-    monkeypatch.setattr(conjugate_gradients, "WORTH_THREADS", 1)
-    monkeypatch.setattr(conjugate_gradients, "processors", lambda: threads)
+    n = math.ceil(math.sqrt(10 * WORTH_THREADS))
+    matrix = sparse.csr_matrix(sparse.random_array((n, n), density=0.101, rng=rng))
+    assert matrix.nnz > WORTH_THREADS
+    vectors = rng.standard_normal((n, n_columns))
     assert np.array_equal(times(matrix, vectors), matrix @ vectors)

@@ -19,7 +19,6 @@ from palpate.errors import ResourceError
 from palpate.parallel import processors
 
 LOOPBACK = "127.0.0.1"
-PATIENCE_S = 600.0  # for a first worker, and for another when all are gone
 MOMENT_S = 1.0
 GATHER_S = 15.0  # for a few lines of JSON from a worker
 ADVICE = "--engine dask needs Dask distributed, which is not installed: pip install 'palpate[cluster]'"
@@ -34,12 +33,14 @@ class DaskEngine:
     """Workers of the Dask scheduler at an address; None: so many processes of this machine, on loopback alone.
 
     Workers must see the cohort's folder and the images under the same paths. Each of a worker's threads takes one case
-    at a time, and all of them share the worker's memory limit.
+    at a time, and all of them share the worker's memory limit. patience_s: how long a first worker is waited for, and
+    another when all are gone.
     """
 
     scheduler: str | None = None
     workers: int | None = None
     work: str = ESTIMATE
+    patience_s: float = 600.0
 
     @property
     def name(self) -> str:
@@ -72,7 +73,7 @@ class DaskEngine:
             except (OSError, ValueError) as error:
                 raise ResourceError(f"no Dask scheduler answers at {self.scheduler}: {error}") from error
             try:
-                yield from packed(_Cluster(client, self.work, self.workers), tasks)
+                yield from packed(_Cluster(client, self), tasks)
             except (OSError, CancelledError, asyncio.CancelledError) as error:  # in the midst of a question to it
                 raise ResourceError(GONE.format(self.scheduler or LOOPBACK)) from error
 
@@ -85,17 +86,17 @@ def attempt_on_worker(task: str, work: str) -> dict[str, Any]:
 class _Cluster:
     """The workers of a scheduler as places."""
 
-    def __init__(self, client: Any, work: str, workers: int | None) -> None:
-        self._client, self._work, self._most = client, work, workers
+    def __init__(self, client: Any, engine: DaskEngine) -> None:
+        self._client, self._engine = client, engine
         self._where: dict[Hashable, str] = {}
 
     def places(self) -> Mapping[str, Place]:
         """The workers that there are, by their addresses; waits for the first. Raises `OSError` without scheduler."""
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + self._engine.patience_s
         while not (workers := self._workers()) and time.monotonic() < end:
             time.sleep(MOMENT_S)
         found = {}
-        for address, worker in list(workers.items())[: self._most]:
+        for address, worker in list(workers.items())[: self._engine.workers]:
             limit = float(worker["memory_limit"] or 0.0)
             found[address] = Place(SHARE * limit / 1e9 if limit else UNKNOWN_GB, int(worker["nthreads"]))
         return found
@@ -112,7 +113,7 @@ class _Cluster:
     def start(self, task: Task, place: str) -> Hashable:
         """Submit an attempt to that worker, and to no other."""
         future: Hashable = self._client.submit(
-            attempt_on_worker, task.to_json(), self._work, workers=[place], allow_other_workers=False, pure=False
+            attempt_on_worker, task.to_json(), self._engine.work, workers=[place], allow_other_workers=False, pure=False
         )
         self._where[future] = place
         return future

@@ -1,0 +1,140 @@
+"""The distinct minima that the starts lead to, and which of them is the best under one objective."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.inversion.objective import AS_GOOD, Evaluation, Objective
+from palpate.inversion.optimise import Bounds, Minimum, same_minimum
+from palpate.inversion.trust_region import NEAR, Convergence, OuterIterate, begun, minimised
+from palpate.mechanics.forward import SolveCounts
+from palpate.progress import silent
+
+COMPARED = replace(NEAR, correlate=False)  # the numbers of independent residuals stay: objectives are compared
+
+
+@dataclass(frozen=True, slots=True)
+class StartRun:
+    """What one start did on the cheapest model: log-moduli (n_parameters,) where it began, and the minimum it found.
+
+    candidate: number of the minimum that it leads to, None where that was not followed, others being lower.
+    """
+
+    theta: NDArray[np.float64]
+    minimum: Minimum
+    candidate: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A distinct minimum as it ended, and its value under the one objective under which all candidates are compared."""
+
+    iterate: OuterIterate
+    value: float
+
+    @property
+    def minimum(self) -> Minimum:
+        """The minimum under its own objective."""
+        return self.iterate.minimum
+
+
+@dataclass(frozen=True, slots=True)
+class Inversion:
+    """The distinct minima, the number of the best one, every start, and the evaluation at no motion (`rest`).
+
+    evaluations, counts: of everything that was followed to find and compare them, not of the best one alone.
+    """
+
+    candidates: tuple[Candidate, ...]
+    best: int
+    starts: tuple[StartRun, ...]
+    rest: Evaluation
+    evaluations: int
+    counts: SolveCounts
+
+    @property
+    def objective(self) -> Objective:
+        """The objective of the best minimum, with its approximations and noise models."""
+        return self.candidates[self.best].iterate.objective
+
+    @property
+    def minimum(self) -> Minimum:
+        """The best minimum; its history is that of the outer loop that all of its starts share."""
+        return self.candidates[self.best].minimum
+
+    @property
+    def convergence(self) -> Convergence:
+        """What the best minimum's last outer iteration left open."""
+        return self.candidates[self.best].iterate.convergence
+
+
+def as_good(value: float, best: float, *, scale: float = 1.0) -> bool:
+    """Whether a minimum with a `value` of minus the log-posterior cannot be told from one with the value `best`.
+
+    By the rule of a 95 % interval: twice their difference, times a `scale` of the deviance (see `Profile`), is below
+    1.96^2. What a value is worth does not depend on how many residuals make it up.
+    """
+    return scale * (value - best) < AS_GOOD
+
+
+def concluded(
+    followed: Sequence[OuterIterate],
+    starts: tuple[StartRun, ...],
+    rest: Evaluation,
+    bounds: Bounds,
+    first: int,
+) -> Inversion:
+    """The distinct ones of the iterates, compared with each other; `first`: the number of the one sought first."""
+    n = followed[0].objective.n_parameters
+    groups = grouped([iterate.minimum for iterate in followed], n)
+
+    def rank(i: int) -> tuple[bool, bool, int]:
+        """A minimum is stood for by the one sought first, else by one that converged."""
+        return i != first, not followed[i].minimum.converged, i
+
+    distinct = [followed[min(members(groups, group), key=rank)] for group in range(max(groups) + 1)]
+    values, evaluations = compared(distinct, bounds)
+    candidates = tuple(Candidate(iterate, value) for iterate, value in zip(distinct, values, strict=True))
+    usable = [c.value if c.minimum.converged else np.inf for c in candidates]
+    best = int(np.argmin(usable)) if np.isfinite(usable).any() else groups[first]
+    joined = tuple(s if s.candidate is None else replace(s, candidate=groups[s.candidate]) for s in starts)
+    return Inversion(candidates, best, joined, rest, evaluations, SolveCounts())
+
+
+def compared(distinct: Sequence[OuterIterate], bounds: Bounds) -> tuple[list[float], int]:
+    """The objective at each iterate, hyper-parameters at their best, and what it cost in evaluations.
+
+    All with the numbers of independent residuals of the first that converged, which are data of an objective.
+    """
+    if len(distinct) == 1:
+        return [distinct[0].objective.total(distinct[0].minimum.evaluation)], 0
+    reference = next((iterate for iterate in distinct if iterate.minimum.converged), distinct[0]).objective
+    values, evaluations = [], 0
+    for iterate in distinct:
+        pairs = zip(iterate.objective.observations, reference.observations, strict=True)
+        same = iterate.objective.with_observations([o.with_correlation(r.noise_model) for o, r in pairs])
+        end = minimised(begun(same, iterate.minimum.unknowns), bounds, COMPARED, progress=silent, title="compared")
+        values.append(end.objective.total(end.minimum.evaluation))
+        evaluations += end.minimum.evaluations
+    return values, evaluations
+
+
+def grouped(minima: Sequence[Minimum], n_parameters: int) -> list[int]:
+    """Number of the distinct minimum that each one is, in their order."""
+    distinct: list[Minimum] = []
+    groups = []
+    for minimum in minima:
+        same = [i for i, other in enumerate(distinct) if same_minimum(minimum.unknowns, other, n_parameters)]
+        if not same:
+            distinct.append(minimum)
+        groups.append(same[0] if same else len(distinct) - 1)
+    return groups
+
+
+def members(groups: Sequence[int], group: int) -> list[int]:
+    """Numbers of those that belong to a group."""
+    return [i for i, of in enumerate(groups) if of == group]
