@@ -52,7 +52,7 @@ class Folding:
 
 @dataclass(frozen=True)
 class Uphill:
-    """Another objective with the wrong sign of its score: what seeks its minimum stays where it begins."""
+    """Another objective, whose score is as wrong as can be: what seeks its minimum stays where it begins."""
 
     of: object
 
@@ -62,7 +62,7 @@ class Uphill:
 
     def __call__(self, unknowns):
         there = self.of(unknowns)
-        return replace(there, score=-there.score)
+        return replace(there, score=-100.0 * there.score)
 
 
 @dataclass(frozen=True)

@@ -66,5 +66,5 @@ def test_the_order_of_the_two_is_that_of_the_columns(fixed, minimum, covariance,
 
 def test_a_fit_that_does_not_end_leaves_the_region_open(toys, fixed, minimum, covariance):
     """With two moduli held, the drivers' motion is not."""
-    least = gauss_newton(fixed, minimum.unknowns, bounds=WIDE, tolerance=1e-9)
+    least = gauss_newton(fixed, minimum.unknowns, bounds=WIDE, tolerance=1e-12)
     assert joint_region(toys.Uphill(fixed), least, (0, 1), covariance=covariance, bounds=WIDE).open

@@ -69,7 +69,7 @@ def test_it_leans_as_the_posterior_does(objective, minimum, variance, rng):
 def test_a_fit_that_does_not_end_makes_no_interval_narrower(toys, objective, minimum, variance):
     """Its deviance is too large, so that the level seems to be reached too soon."""
     fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
-    least = gauss_newton(fixed, minimum.unknowns, bounds=WIDE, tolerance=1e-9)
+    least = gauss_newton(fixed, minimum.unknowns, bounds=WIDE, tolerance=1e-12)
     for number, centre in enumerate(least.unknowns[:2]):
         given = {"variance": variance[number], "bounds": WIDE, "level": NORMAL_95}
         whole, found = (profile(of, least, number, **given) for of in (fixed, toys.Uphill(fixed)))
