@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +27,7 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns.blocks import Acts, Block
 
 LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the block's own kernel: no mode is forbidden
+SEEN = 1e-13  # of the largest information, below which a direction is one that rounding makes
 FITTED = 0.5  # of a kind's residuals, the largest share that is taken for fitted by the unknowns
 
 LogEvidence = Callable[[NDArray[np.float64]], tuple[float, NDArray[np.float64]]]
@@ -140,40 +140,50 @@ class _Seen:
     information: NDArray[np.float64]
     pull: NDArray[np.float64]
 
-    def log_evidence(
-        self, terms: Sequence[NDArray[np.float64]], variances: NDArray[np.float64]
-    ) -> tuple[float, NDArray[np.float64]]:
-        """F = 1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) for C = sum_t v_t C_t, and dF / d v_t (n_terms,).
+    def whitened(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """R (r, n) and t (r,) with A = R^T R and b = R^T t: the data's own directions, as many as they see."""
+        sizes, vectors = linalg.eigh(self.information, check_finite=False)
+        kept = sizes >= max(SEEN * sizes[-1], np.finfo(np.float64).tiny)
+        roots = np.sqrt(sizes[kept])
+        return roots[:, None] * vectors[:, kept].T, vectors[:, kept].T @ self.pull / roots
 
-        With x = (A + C^-1)^-1 b, w = b - A x and G = A (1 + C A)^-1 the derivative is 1/2 (w^T C_t w - tr C_t G).
-        """
-        covariance = sum((v * term for v, term in zip(variances, terms, strict=True)), np.zeros_like(terms[0]))
-        inner = covariance @ self.information
-        inner[np.diag_indices_from(inner)] += 1.0
-        factor = linalg.lu_factor(inner, overwrite_a=True, check_finite=False)
-        x = linalg.lu_solve(factor, covariance @ self.pull, check_finite=False)
-        left = self.pull - self.information @ x
-        determinant = float(np.sum(np.log(np.abs(np.diag(factor[0])))))
-        response = linalg.lu_solve(factor, self.information.T, trans=1, check_finite=False)  # G^T
-        slopes = [0.5 * float(left @ term @ left - np.sum(term * response)) for term in terms]
-        return 0.5 * float(self.pull @ x) - 0.5 * determinant, np.array(slopes)
 
-    def of_one_term(self, term: NDArray[np.float64]) -> LogEvidence:
-        """The same of one term C_1 = L L^T: F = 1/2 sum_i (v c_i^2 / (1 + v l_i) - ln(1 + v l_i)).
+def log_evidence(
+    terms: Sequence[NDArray[np.float64]], root: NDArray[np.float64], target: NDArray[np.float64]
+) -> LogEvidence:
+    """F = 1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) of C = sum_t v_t C_t, with A = R^T R and b = R^T t.
 
-        l_i, V: eigenvalues and vectors of L^T A L, once for all variances v; c = V^T L^T b.
-        """
-        root = linalg.cholesky(term, lower=True, check_finite=False)
-        sizes, axes = linalg.eigh(root.T @ self.information @ root, check_finite=False)
-        sizes, squares = np.maximum(sizes, 0.0), (axes.T @ (root.T @ self.pull)) ** 2
+    With D_t = R C_t R^T, K = sum_t v_t D_t and w = (1 + K)^-1 t it is 1/2 (w^T K t - ln det(1 + K)), its derivatives
+    dF / d v_t = 1/2 (w^T D_t w - tr (1 + K)^-1 D_t). A single D_t is made diagonal once for all variances.
+    """
+    seen = [root @ term @ root.T for term in terms]
+    if len(seen) == 1:
+        sizes, axes = linalg.eigh(seen[0], check_finite=False) if len(root) else (np.zeros(0), np.zeros((0, 0)))
+        sizes, squares = np.maximum(sizes, 0.0), (axes.T @ target) ** 2
 
-        def evidence(variances: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        def of_one(variances: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
             """F and dF / dv (1,) at a variance (1,)."""
             grown = 1.0 + variances[0] * sizes
-            value = 0.5 * float(np.sum(variances[0] * squares / grown - np.log(grown)))
-            return value, np.array([0.5 * float(np.sum((squares / grown - sizes) / grown))])
+            value = 0.5 * float(np.sum(variances[0] * sizes * squares / grown - np.log(grown)))
+            return value, np.array([0.5 * float(np.sum(sizes * (squares / grown - 1.0) / grown))])
 
-        return evidence
+        return of_one
+    stack = np.stack(seen)
+
+    def of_several(variances: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """F and dF / dv (n_terms,) at variances (n_terms,)."""
+        moved = np.tensordot(variances, stack, axes=1)
+        whole = moved.copy()
+        whole[np.diag_indices_from(whole)] += 1.0
+        factor = linalg.cholesky(whole, lower=True, overwrite_a=True, check_finite=False)
+        at_best = linalg.cho_solve((factor, True), target, check_finite=False)
+        determinant = 2.0 * float(np.sum(np.log(np.diag(factor))))
+        inverse, _ = linalg.lapack.dpotri(factor, lower=1, overwrite_c=1)  # its lower triangle
+        traces = 2.0 * np.einsum("tij,ij->t", stack, inverse) - np.einsum("tii,ii->t", stack, inverse)
+        slopes = 0.5 * (np.einsum("i,tij,j->t", at_best, stack, at_best, optimize=True) - traces)
+        return 0.5 * (float(at_best @ moved @ target) - determinant), slopes
+
+    return of_several
 
 
 def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
@@ -291,8 +301,9 @@ def _beliefs(
     """
     with determined():
         seen = _seen(data + prior, data, pull, places)
-        odds = block.odds or (0.0,) * len(block.alternatives)
-        return [_most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)]
+        data_space, odds = seen.whitened(), block.odds or (0.0,) * len(block.alternatives)
+        pairs = zip(block.alternatives, odds, strict=True)
+        return [_most_evident(terms, data_space, block, odd) for terms, odd in pairs]
 
 
 def _seen(
@@ -314,11 +325,14 @@ def _seen(
 
 
 def _most_evident(
-    terms: Sequence[NDArray[np.float64]], seen: _Seen, block: Block, odds: float
+    terms: Sequence[NDArray[np.float64]],
+    data_space: tuple[NDArray[np.float64], NDArray[np.float64]],
+    block: Block,
+    odds: float,
 ) -> tuple[float, NDArray[np.float64]]:
     """The largest log-evidence, with its log prior odds, of a family of priors of a block; its covariance (n, n)."""
     floored = [term + LEAST_VARIANCE * np.eye(len(term)) for term in terms]
-    evidence = seen.of_one_term(floored[0]) if len(floored) == 1 else partial(seen.log_evidence, floored)
+    evidence = log_evidence(floored, *data_space)
 
     def worse(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """Minus the log-evidence at ln of the amplitudes (n_terms,), with its derivative."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,42 @@ class OpenPoisson:
 
 
 @dataclass(frozen=True, slots=True)
+class _Layout:
+    """Where the unknowns of blocks stand among all: of each block (n,), and by how they act in which state (n,).
+
+    on_moduli (n,): those that act on moduli, in every later state; shares (n,): theirs; of_regions (n_regions, n): 1
+    where such an unknown is one of a region.
+    """
+
+    blocks: tuple[NDArray[np.int64], ...]
+    acting: dict[tuple[Acts, int], NDArray[np.int64]]
+    on_moduli: NDArray[np.int64]
+    shares: NDArray[np.float64]
+    of_regions: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, blocks: Sequence[Block], first: int, n_regions: int) -> _Layout:
+        """That of blocks whose unknowns follow each other, the first of them with a number."""
+        ends = np.cumsum([first, *(block.size for block in blocks)])
+        places = tuple(np.arange(*pair) for pair in pairwise(ends.tolist()))
+
+        def joint(kept: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+            return np.concatenate([np.zeros(0, dtype=np.int64), *kept])
+
+        pairs, states = list(zip(blocks, places, strict=True)), {state for block in blocks for state in block.states}
+        acting = {(a, k): joint([p for b, p in pairs if b.acts is a and k in b.states]) for a in Acts for k in states}
+        own = [block for block in blocks if block.acts is Acts.MODULI]
+        of_regions = [np.isin(np.arange(n_regions), block.regions) for block in own]
+        return cls(
+            places,
+            acting,
+            joint([place for block, place in pairs if block.acts is Acts.MODULI]),
+            np.array([block.share for block in own]),
+            np.array(of_regions, dtype=np.float64).reshape(len(own), n_regions).T,
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class ParameterMap:
     """Unknowns x = [theta, x_1, ..., x_B] (n_unknowns,): the parameters theta, then those of the `blocks`.
 
@@ -84,9 +121,11 @@ class ParameterMap:
     nuisance_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     nuisance_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     poisson: tuple[OpenPoisson, ...] = ()
+    _layout: _Layout = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         n = self.n_parameters
+        object.__setattr__(self, "_layout", _Layout.of(self.blocks, n, len(self.base)))
         defaults = {
             "prior_mean": np.zeros(n),
             "prior_precision": np.zeros((n, n)),
@@ -156,13 +195,11 @@ class ParameterMap:
 
     def columns(self, block: int) -> NDArray[np.int64]:
         """Numbers (n,) among all unknowns of those of a block."""
-        start = self.n_parameters + sum(before.size for before in self.blocks[:block])
-        return np.arange(start, start + self.blocks[block].size)
+        return self._layout.blocks[block]
 
     def acting(self, acts: Acts, state: int) -> NDArray[np.int64]:
         """Numbers (n,) of the unknowns that act so in a later state, in the order of the blocks."""
-        own = [self.columns(i) for i, b in enumerate(self.blocks) if b.acts is acts and state in b.states]
-        return np.concatenate([np.zeros(0, dtype=np.int64), *own])
+        return self._layout.acting.get((acts, state), np.zeros(0, dtype=np.int64))
 
     @property
     def prior_matrix(self) -> NDArray[np.float64]:
@@ -185,7 +222,9 @@ class ParameterMap:
         """
         logarithms = self.selection @ unknowns[: self.n_parameters]
         if len(unknowns) > self.n_parameters:
-            logarithms = logarithms + self._of_blocks @ in_series(self._on_moduli(unknowns), self.shares_on_moduli)
+            logarithms = logarithms + self._layout.of_regions @ in_series(
+                self._on_moduli(unknowns), self.shares_on_moduli
+            )
         moduli = np.asarray(self.base * np.exp(logarithms))
         for open_ in self.poisson:
             moduli[list(open_.regions)] *= open_.weights(unknowns)[0]
@@ -200,30 +239,22 @@ class ParameterMap:
         for open_ in self.poisson:
             by_theta[list(open_.regions), open_.column] = open_.weights(unknowns)[1]
         slopes = in_series_slopes(self._on_moduli(unknowns), self.shares_on_moduli)
-        return np.concatenate([by_theta, self._of_blocks * slopes], axis=1)
+        return np.concatenate([by_theta, self._layout.of_regions * slopes], axis=1)
 
     @property
     def acting_on_moduli(self) -> NDArray[np.int64]:
         """Numbers (n,) of the blocks' unknowns by which moduli of regions differ, in every later state."""
-        own = [self.columns(i) for i, block in enumerate(self.blocks) if block.acts is Acts.MODULI]
-        return np.concatenate([np.zeros(0, dtype=np.int64), *own])
+        return self._layout.on_moduli
+
+    @property
+    def shares_on_moduli(self) -> NDArray[np.float64]:
+        """Of the regions of each unknown that acts on moduli, the share (n,) that it is of."""
+        return self._layout.shares
 
     def _on_moduli(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Those (n,) of unknowns (n_unknowns,) that act on moduli; 0 where there is theta alone."""
         own = self.acting_on_moduli
         return unknowns[own] if len(unknowns) > self.n_parameters else np.zeros(len(own))
-
-    @property
-    def shares_on_moduli(self) -> NDArray[np.float64]:
-        """Of the regions of each unknown that acts on moduli, the share (n,) that it is of."""
-        return np.array([block.share for block in self.blocks if block.acts is Acts.MODULI])
-
-    @property
-    def _of_blocks(self) -> NDArray[np.float64]:
-        """1 where an unknown that acts on moduli is one of a region, (n_regions, n)."""
-        blocks = [block for block in self.blocks if block.acts is Acts.MODULI]
-        columns = [np.isin(np.arange(len(self.base)), block.regions) for block in blocks]
-        return np.array(columns, dtype=np.float64).reshape(len(columns), len(self.base)).T
 
     def coefficients(self, unknowns: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """What the model of each state takes beside the moduli (n_modes,): boundary modes, then material modes."""
