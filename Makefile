@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: commands install demo test quick style lint check clean pardiso benchmark-setup schemas docs lock dist dist-test minimum report-check export-check
+.PHONY: commands install demo test acceptance quick style lint check clean pardiso benchmark-setup schemas docs lock dist dist-test minimum report-check export-check
 
 install: $(VENV)/.installed
 
@@ -46,10 +46,15 @@ PYTEST = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MALLOC_MMAP_THRESHOLD_=4294967
 # mypy has one thread: it runs beside the tests, and either of them fails the target.
 test: style
 	$(BIN)/mypy & types=$$!; \
-	$(PYTEST); tests=$$?; \
+	$(PYTEST) -m "not acceptance"; tests=$$?; \
 	wait $$types && exit $$tests
 
-check: test
+# The demo, examples, notebooks and experiments as they are documented, and laws that take many estimates to be seen:
+# tests of over ten seconds each, a hundredth of all tests and two fifths of their time. Before a landing or a release.
+acceptance: install
+	$(PYTEST) -m acceptance
+
+check: test acceptance
 
 # Laws of every layer, in under a minute.
 quick: install

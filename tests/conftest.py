@@ -181,6 +181,8 @@ TESTS = Path(__file__).parent
 # Files, and folders of them, with the longest tests, or a process for every one. `make quick` leaves them out; every
 # layer has others. They come first, the longest before all, so that no processor waits for another at the end.
 SLOW = (TESTS / "slow.txt").read_text(encoding="utf-8").split()
+# Tests of over ten seconds each: whole documents, and repeated experiments. `make acceptance` runs them, not `make test`.
+ACCEPTANCE = tuple(f"tests/{entry}" for entry in (TESTS / "acceptance.txt").read_text(encoding="utf-8").split())
 
 
 def pytest_collection_finish():
@@ -190,7 +192,7 @@ def pytest_collection_finish():
 
 
 def pytest_collection_modifyitems(items):
-    """Mark the slow tests, and put them in their order."""
+    """Mark the slow tests and those of the acceptance, and put them in their order."""
     place = {(TESTS / name).resolve(strict=True): number for number, name in enumerate(SLOW)}
 
     def order(item) -> int:
@@ -200,6 +202,8 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if order(item) < len(SLOW):
             item.add_marker("slow")
+        if item.nodeid.startswith(ACCEPTANCE):
+            item.add_marker("acceptance")
 
 
 @pytest.fixture(autouse=True, scope="module")

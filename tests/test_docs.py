@@ -113,6 +113,12 @@ def test_every_path_that_newcomers_are_told_is_there():
     assert [name for name in sorted(named) if not any((place / name).exists() for place in places)] == []
 
 
+@pytest.mark.parametrize("entry", (ROOT / "tests" / "acceptance.txt").read_text(encoding="utf-8").split())
+def test_what_the_acceptance_lists_is_a_test(entry):
+    path, _, name = entry.partition("::")
+    assert f"def {name.partition('[')[0]}" in (ROOT / "tests" / path).read_text(encoding="utf-8")
+
+
 TOOLS = {"import-linter": "lint-imports", "mkdocs-material": "material", "pytest-xdist": "-n 2", "scipy-stubs": "mypy"}
 MODULES = {"h5py": "h5netcdf", "libigl": "igl", "pynrrd": "nrrd", "scikit-fem": "skfem", "torch-fem": "torchfem"}
 

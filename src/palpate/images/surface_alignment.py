@@ -133,7 +133,8 @@ def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
     centre = np.average([here for here, _ in middles], axis=0)
     shift = np.median([there - here for here, there in middles], axis=0)
     still = _trial(surfaces, centre, np.zeros(6))
-    starts = [still, _trial(surfaces, centre, np.concatenate([np.zeros(3), shift]))]
+    moved = np.linalg.norm(shift) > ROUGHNESS_MM  # else both starts lead to one place
+    starts = [still, *([_trial(surfaces, centre, np.concatenate([np.zeros(3), shift]))] if moved else [])]
     found = [_descended(surfaces, centre, start) for start in starts if start.n_seen >= LEAST_POINTS]
     if not found:
         raise InputDataError(

@@ -49,8 +49,9 @@ def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name
         """The two histograms over each other, values beyond the axis in its outer bins."""
         axes = figure.add_axes((0.14, 0.2, 0.83, 0.74))
         clipped = [np.clip(values, -reach, reach) for values in (fitted, rest)]
-        axes.hist(clipped[0], bins=list(bins), weights=share, color=tissue.colour, alpha=0.85, label="fitted")
-        axes.hist(clipped[1], bins=list(bins), weights=share, histtype="step", color=INK, linewidth=1.1, label="no fit")
+        with_fit, without = (np.histogram(values, bins, weights=share)[0] for values in clipped)
+        axes.stairs(with_fit, bins, fill=True, color=tissue.colour, alpha=0.85, label="fitted")
+        axes.stairs(without, bins, color=INK, linewidth=1.1, label="no fit")
         for place in (-voxel, voxel):
             axes.axvline(place, color=INK, linewidth=0.9, linestyle=DASHED)
         axes.text(voxel, 1.0, " one voxel", transform=axes.get_xaxis_transform(), fontsize=7.5, va="top")
