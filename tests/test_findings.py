@@ -10,12 +10,9 @@ import pytest
 
 from palpate.findings import CODES, HARMLESS, Finding, known_code, of_pair, one_a_cause, warning_rows
 from palpate.images.alignment import Alignment, RigidFit, RigidMotion
-from palpate.images.label_image import LabelImage, VoxelGrid
-from palpate.images.segmentation import segment
-from palpate.images.tissue import Role, Tissue
-from palpate.study import imaged
+from palpate.images.checks import later_names
 from palpate.study.estimate_findings import inversion_findings
-from palpate.study.imaged import aligned
+from palpate.study.imaged import alignment_findings
 
 SEEN = [Finding("thin", f"thin in {image}", "prostate", f"in {image}") for image in ("before", "after[1]", "after[2]")]
 
@@ -53,15 +50,12 @@ def test_a_code_that_is_not_registered_is_refused():
         known_code("tin")
 
 
-def test_bones_in_pieces_unseen_or_round_are_one_warning_each_over_all_bones_and_images(monkeypatch):
-    tissues = tuple(Tissue(name, role, (n,)) for n, (name, role) in enumerate(NAMED.items(), start=1))
-    images = [scene(shift, tissues) for shift in (0, 1, 2)]
+def test_bones_in_pieces_unseen_or_round_are_one_warning_each_over_all_bones_and_images():
     still = RigidMotion(np.eye(3), np.zeros(3))
     fits = {"hip": RigidFit(still, 0.1, 0, np.zeros((0, 3))), "femur": RigidFit(still, 0.1, 90, np.eye(3)[:1])}
     loose = {"hip": 2.0, "femur": 1.5}
-    monkeypatch.setattr(imaged, "align", lambda *_: Alignment(fits["femur"], fits, loose))
-    found = one_a_cause(aligned(images[0], tuple(images[1:]), method="rigid-tissues").findings)
-    of_bones = [each for each in found if each.code in ("several-bodies", "rigid-unseen", "rotation-undetermined")]
+    alignment = Alignment(fits["femur"], fits, loose)
+    of_bones = one_a_cause([finding for name in later_names(2) for finding in alignment_findings(alignment, name)])
     assert [each.code for each in of_bones] == ["several-bodies", "rotation-undetermined", "rigid-unseen"]
     assert "'hip' 2.0 mm, 'femur' 1.5 mm" in of_bones[0].message
     assert of_bones[0].message.endswith("also in 'after[2]' ('hip' 2.0 mm, 'femur' 1.5 mm)")
@@ -81,14 +75,3 @@ def test_moduli_that_depend_on_each_other_are_one_warning_with_every_pair():
     assert finding.code == "correlated"
     assert "'prostate' and 'bladder', of 'bladder' and 'uterus' cannot" in finding.message
     assert inversion_findings(inversion, np.diag(sd)) == ()
-
-
-NAMED = {"prostate": Role.ESTIMATE, "hip": Role.RIGID, "femur": Role.RIGID, "rest": Role.ESTIMATE}
-
-
-def scene(shift, tissues):
-    labels = np.full((24, 24, 24), 4)
-    labels[6 + shift : 14 + shift, 6:14, 6:14] = 1
-    labels[2:5, 2:9, 2:9] = 2
-    labels[2:5, 15:22, 15:22] = 3
-    return segment(LabelImage(labels, VoxelGrid((24, 24, 24), np.eye(4))), tissues)

@@ -113,7 +113,7 @@ def brought(
         progress(f"'{name}' {alignments[-1].in_words}")
         images.append(moved(image, fit.motion.inverse()))
         bones.append({i: alignment.remaining(bone, fit) for i, bone in rigid.items()} if alignment else {})
-        findings += _alignment_findings(alignment, name) if alignment else []
+        findings += alignment_findings(alignment, name) if alignment else []
         findings += _frame_findings(before, alignments[-1], name)
     return ImagedStates(before, tuple(images), tuple(bones), tuple(findings), alignments=tuple(alignments))
 
@@ -141,7 +141,7 @@ def _frame_findings(before: Segmentation, found: Registration, name: str, *, ali
     return [Finding("frame-moves", text, place=place)]
 
 
-def _alignment_findings(alignment: Alignment, name: str) -> list[Finding]:
+def alignment_findings(alignment: Alignment, name: str) -> list[Finding]:
     """What the motion of the bones to the image called `name` rests on, all bones in one finding a cause."""
     findings = []
     unseen = [bone for bone, fit in alignment.tissues.items() if fit.n_points == 0]
