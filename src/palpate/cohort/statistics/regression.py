@@ -19,7 +19,6 @@ LEAST_BETWEEN, LEAST_WITHIN, LARGEST = 0.01, 0.05, 3.0  # standard deviations of
 STEEPEST = 10.0  # change of ln E over all stages: beyond it an end is open
 PLACES = np.linspace(-5.0, 5.0, 81)  # of a patient's own modulus, in standard deviations
 WEIGHTS = stats.norm.logpdf(PLACES) + np.log(PLACES[1] - PLACES[0])
-DIFFERENCE = 1e-4  # of ln E, for derivatives
 BISECTIONS = 8
 
 Array = NDArray[np.float64]
@@ -132,34 +131,67 @@ class _Data:
         sums = np.bincount(patients, np.concatenate([self.y, ends]), self.n)
         return np.asarray(sums / np.bincount(patients, minlength=self.n))
 
-    def log_likelihood(self, mean: Array, between: float, within: float) -> Array:
-        """Of each patient (n,), whose own ln E lies about `mean` (n,) with the standard deviation `between`.
+    def log_likelihood(self, mean: Array, between: float, within: float) -> _LogLikelihood:
+        """Of each patient, whose own ln E lies about `mean` (n,) with the standard deviation `between`.
 
         Values are integrated over the patient's own modulus in closed form; the probabilities of censored scans over
         what the values leave of it, by the trapezoidal rule.
         """
-        weights = 1.0 / (self.variances + within**2)
-        precision = np.bincount(self.of_value, weights, self.n)
-        own = np.bincount(self.of_value, weights * self.y, self.n) / np.maximum(precision, 1e-300)
-        away = np.bincount(self.of_value, weights * (self.y - own[self.of_value]) ** 2, self.n)
-        logs = np.bincount(self.of_value, np.log(weights / (2.0 * np.pi)), self.n)
-        shrunk = 1.0 + precision * between**2
-        found = 0.5 * (logs - away - np.log(shrunk) - (own - mean) ** 2 * precision / shrunk)
+        tau, omega = between**2, within**2
+
+        def sums(of_values: Array) -> Array:
+            """Of each patient (n,)."""
+            return np.asarray(np.bincount(self.of_value, of_values, self.n), dtype=np.float64)
+
+        weights = 1.0 / (self.variances + omega)
+        slopes = -2.0 * omega * weights**2  # of the weights by ln within
+        precision, by_within = sums(weights), sums(slopes)
+        some = np.maximum(precision, 1e-300)
+        own = sums(weights * self.y) / some
+        own_by_within = (sums(slopes * self.y) - own * by_within) / some
+        squares = (self.y - own[self.of_value]) ** 2
+        shrunk, apart = 1.0 + precision * tau, own - mean
+        grows, kept = np.stack([2.0 * precision * tau, by_within * tau]), precision / shrunk
+        found = 0.5 * (sums(np.log(weights / (2.0 * np.pi)) - weights * squares) - np.log(shrunk) - apart**2 * kept)
+        by_sd = -0.5 * grows / shrunk * (1.0 - apart**2 * kept)
+        by_sd[1] += 0.5 * sums(slopes / weights - slopes * squares)
+        by_sd[1] -= apart * own_by_within * kept + 0.5 * apart**2 * by_within / shrunk
         if not len(self.of_censored):
-            return np.asarray(found)
-        centre, spread = (mean + between**2 * precision * own) / shrunk, between / np.sqrt(shrunk)
+            return _LogLikelihood(found, apart * kept, by_sd)
+        centre, spread = (mean + tau * precision * own) / shrunk, between / np.sqrt(shrunk)
+        drawn = np.stack([2.0 * tau * precision * own, tau * (by_within * own + precision * own_by_within)])
+        centres, spreads = (drawn - centre * grows) / shrunk, -0.5 * spread * grows / shrunk
+        spreads[0] += spread
         held, of_held = np.unique(self.of_censored, return_inverse=True)
+        member = np.asarray(of_held == np.arange(len(held))[:, None], dtype=np.float64)
         at = (centre[held, None] + spread[held, None] * PLACES)[of_held]
-        inside = np.tile(WEIGHTS, (len(held), 1))
         # logarithm of the standard normal probability of (low, high), without loss in either tail
-        low = (self.lows[:, None] - at) / within
-        high = (self.highs[:, None] - at) / within
+        low, high = (self.lows[:, None] - at) / within, (self.highs[:, None] - at) / within
         below, above = np.where(low > 0.0, -high, low), np.where(low > 0.0, -low, high)
         largest = special.log_ndtr(above)
-        chances = np.asarray(largest + np.log1p(-np.exp(np.minimum(special.log_ndtr(below) - largest, -1e-12))))
-        np.add.at(inside, of_held, chances)
-        found[held] += special.logsumexp(inside, axis=1)
-        return np.asarray(found)
+        chances = largest + np.log1p(-np.exp(np.minimum(special.log_ndtr(below) - largest, -1e-12)))
+        densities = [np.exp(-0.5 * end**2 - 0.5 * np.log(2.0 * np.pi) - chances) for end in (low, high)]
+        ends = [np.where(np.isfinite(end), end, 0.0) for end in (low, high)]
+        inside = WEIGHTS + member @ chances
+        likely = special.logsumexp(inside, axis=1)
+        shares = np.exp(inside - likely[:, None])
+        by_place = shares * (member @ (densities[0] - densities[1])) / within
+        by_centre, by_spread = by_place.sum(axis=1), by_place @ PLACES
+        found[held] += likely
+        by_mean = apart * kept
+        by_mean[held] += by_centre / shrunk[held]
+        by_sd[:, held] += by_centre * centres[:, held] + by_spread * spreads[:, held]
+        by_sd[1, held] += (shares * (member @ (ends[0] * densities[0] - ends[1] * densities[1]))).sum(axis=1)
+        return _LogLikelihood(found, by_mean, by_sd)
+
+
+@dataclass(frozen=True, slots=True)
+class _LogLikelihood:
+    """Of each patient (n,), with its derivatives by the mean (n,) and by ln `between` and ln `within` (2, n)."""
+
+    values: Array
+    by_mean: Array
+    by_sd: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,11 +220,9 @@ class _Regression:
         near: unknowns of a fit that is not far from it.
         """
         fit = _Fit.of(self._fit(self.columns, slope * self.x, near), self.columns, slope * self.x)
-        ahead, behind = (
-            self.data.log_likelihood(fit.mean + sign * DIFFERENCE, fit.between, fit.within) for sign in (1.0, -1.0)
-        )
+        scores = self.data.log_likelihood(fit.mean, fit.between, fit.within).by_mean
         alone = self.x - self.columns @ np.linalg.lstsq(self.columns, self.x)[0]
-        return permutation_test(alone, (ahead - behind) / (2.0 * DIFFERENCE), seed=self.seed)
+        return permutation_test(alone, scores, seed=self.seed)
 
     def interval(self, slope: float) -> tuple[float | None, float | None]:
         """The slopes around the most likely one that the test does not reject at 5 %."""
@@ -224,10 +254,10 @@ class _Regression:
         first = np.linalg.lstsq(columns, data.middles - offset)[0]
         scatter = float(np.clip(np.std(data.middles - offset - columns @ first), 2.0 * LEAST_WITHIN, 1.0))
 
-        def negative(at: Array) -> float:
-            """Minus the log-likelihood of coefficients and logarithms of standard deviations."""
-            between, within = np.exp(at[k:])
-            return -float(data.log_likelihood(offset + columns @ at[:k], between, within).sum())
+        def negative(at: Array) -> tuple[float, Array]:
+            """Minus the log-likelihood of coefficients and logarithms of standard deviations, with its gradient."""
+            there = data.log_likelihood(offset + columns @ at[:k], *np.exp(at[k:]))
+            return -float(there.values.sum()), -np.concatenate([there.by_mean @ columns, there.by_sd.sum(axis=1)])
 
         single = len(data.y) + len(data.lows) == data.n
         held = np.log([LEAST_WITHIN, LEAST_WITHIN if single else LARGEST])
@@ -236,6 +266,5 @@ class _Regression:
         if k > self.columns.shape[1]:
             bounds[k - 1] = (-self.steepest, self.steepest)
         start = np.array([*first, np.log(scatter), np.log(LEAST_WITHIN if single else scatter)])
-        return np.asarray(
-            optimize.minimize(negative, start if near is None else near, bounds=bounds, method="L-BFGS-B").x
-        )
+        begin = start if near is None else near
+        return np.asarray(optimize.minimize(negative, begin, jac=True, bounds=bounds, method="L-BFGS-B").x)
