@@ -24,6 +24,7 @@ BLOCK = 256  # columns of a large front that are eliminated before the others he
 Everywhere = Callable[[Callable[[Any], None], Iterable[Any]], None]
 FEW = 6  # right-hand sides of a thread up to which a large front, once in the cache, is best met by one at a time
 WIDE = 96  # columns of such a front
+ALONE = 4  # right-hand sides up to which threads would wait for Python's lock longer than they compute
 LARGEST_BLOCK = 64  # right-hand sides of a thread; more at once are not faster and take more memory
 
 
@@ -189,7 +190,7 @@ def substituted(plan: Plan, factor: Matrix, rhs: NDArray[np.float64]) -> NDArray
     ends = np.linspace(0, m, max(-(-m // (LARGEST_BLOCK * threads)), 1) + 1).astype(int).tolist()
     for begin, end in pairwise(ends):
         x = np.ascontiguousarray(rhs[plan.order, begin:end], dtype=factor.dtype)
-        if threads == 1:
+        if threads == 1 or end - begin <= ALONE:
             _forward(plan.fronts, factor, x)
             _backward(plan.fronts, factor, x)
         else:
