@@ -346,8 +346,15 @@ class FiniteStrainEquilibrium:
         def along(directions: Array) -> Array:
             """Those of several directions."""
             of_moduli, of_modes, of_material = np.split(directions, ends)
-            moved = stiffness @ np.asarray(self.model.constraint.modes @ of_modes)
-            return np.asarray(by_region @ of_moduli + moved + by_material.along(of_material))
+            forces = np.asarray(by_region @ of_moduli)
+            parts: list[tuple[Array, Callable[[Array], Array]]] = [
+                (of_modes, lambda part: np.asarray(stiffness @ np.asarray(self.model.constraint.modes @ part))),
+                (of_material, by_material.along),
+            ]
+            for part, along_part in parts:
+                some = part.any(axis=0)  # of unit vectors each has one of all parts
+                forces[:, some] += along_part(part[:, some])
+            return forces
 
         return along
 
