@@ -14,11 +14,9 @@ from palpate.study import Case, aligned, estimate_states
 __all__ = ["shares_of_stages"]
 
 STAGES = {  # functions whose time, with all that they call, is a stage of its own
-    "images checked and aligned": ("body.py", "aligned"),
+    "images checked and aligned": ("imaged.py", "aligned"),
     "level sets": ("anatomy.py", "anatomy_of"),
-    "tetrahedra cut": ("tetrahedralise.py", "_grid"),
-    "tetrahedra remeshed": ("remeshing.py", "remeshed"),
-    "surfaces fitted, tetrahedra smoothed": ("tetrahedralise.py", "_fitted"),
+    "tetrahedra": ("tetrahedralise.py", "tetrahedralise"),
     "mesh gate": ("quality.py", "check_mesh"),
     "distance maps and targets": ("surface_distance.py", "surface_distances"),
     "wall modes": ("prescribed_motion.py", "prescribed_motion"),
@@ -28,8 +26,11 @@ STAGES = {  # functions whose time, with all that they call, is a stage of its o
     "linear estimate": ("estimate.py", "_linear"),
     "finite-strain estimate": ("estimate.py", "continue_at_finite_strain"),
     "intervals and fits": ("estimation.py", "conclude"),
+    "what would change the answer": ("variations.py", "what_would_change"),
 }
 WITHIN = {  # parts of the stages above
+    "tetrahedra remeshed": ("remeshing.py", "remeshed"),
+    "tetrahedra smoothed": ("smoothing.py", "smoothed"),
     "closest points": ("surface_residuals.py", "_closest"),
     "voxels of the model": ("voxelise.py", "voxelise"),
     "noise model": ("noise_model.py", "fit_noise_model"),

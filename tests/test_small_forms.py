@@ -28,3 +28,13 @@ def test_a_small_form_has_flags_that_its_script_knows(form):
     text = (ROOT / "benchmarks" / script).read_text(encoding="utf-8")
     for flag in (word for word in words if word.startswith("--")):
         assert f'"{flag}"' in text, flag
+
+
+def test_the_stages_whose_time_is_told_are_functions():
+    stages = re.findall(
+        r'\("(\w+\.py)", "(\w+)"\)', (ROOT / "benchmarks" / "speed_stages.py").read_text(encoding="utf-8")
+    )
+    assert len(stages) > 10
+    for file, function in stages:
+        found = (ROOT / "src" / "palpate").rglob(file)
+        assert any(f"def {function}(" in path.read_text(encoding="utf-8") for path in found), (file, function)
