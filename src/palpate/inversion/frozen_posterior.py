@@ -6,6 +6,7 @@ reduced model it is a quadratic form in the model's amplitudes: an evaluation fo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,8 +61,12 @@ class FixedCorrespondence:
                 jacobian = line.jacobian.under(tangent[rows])
                 residuals = replace(line.residuals, values=values)
                 lines.append(Linearisation.of(line.observation, s, residuals, line.columns, jacobian, line.weights))
+        return self.assembled(unknowns, lines)
+
+    def assembled(self, unknowns: NDArray[np.float64], lines: Sequence[Linearisation]) -> Evaluation:
+        """J at `unknowns` (n_unknowns,) where its linearisations there are known."""
         found = self.objective.assembled(unknowns, lines)
-        away = float((unknowns - mapping.prior_centre) @ found.prior_score)
+        away = float((unknowns - self.objective.parameters.prior_centre) @ found.prior_score)
         squares = sum(line.precision * float(line.weights @ line.residuals.values**2) for line in lines)
         return replace(found, value=0.5 * (away + squares))
 

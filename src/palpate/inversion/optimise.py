@@ -142,8 +142,9 @@ def gauss_newton(
     tolerance: float = 1e-3,
     within: NDArray[np.float64] | float = np.inf,
     max_steps: int = 40,
+    begin: Evaluation | None = None,
 ) -> Minimum:
-    """Minimise `objective` from `start` (n_unknowns,).
+    """Minimise `objective` from `start` (n_unknowns,), where it is `begin` if that is known.
 
     Step: (J^T W J + P + mu D) d = -s, s the score, with the log-moduli's part no longer than the trust radius; a step
     is taken when it reduces the objective (Nocedal & Wright 2006, Algorithm 4.1). It ends when the decrement -s.d / 2,
@@ -152,7 +153,7 @@ def gauss_newton(
     log-moduli (n_parameters,) keep their values, or whether all do.
     """
     unknowns, region, history, n = start.copy(), TrustRegion(), list[Iterate](), objective.n_parameters
-    now, evaluations, outcome = objective(unknowns), 1, Outcome.STEPS
+    now, evaluations, outcome = begin or objective(unknowns), 1, Outcome.STEPS
     for _ in range(max_steps):
         if not np.isfinite(now.value):
             outcome = Outcome.NOT_FINITE

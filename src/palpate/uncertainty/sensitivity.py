@@ -86,9 +86,14 @@ class FastPath:
         if dropped is not None:
             precision, start[n:] = precision + DROPPED * np.diag(dropped), np.where(dropped, 0.0, start[n:])
         objective = replace(fixed.objective, parameters=replace(parameters, nuisance_precision=precision))
-        lines = self._moved(errors, fixed.lines) if errors else fixed.lines
+        lines, there = fixed.lines, self.least.evaluation.linearisations
+        if errors:
+            lines, there = self._moved(errors, lines), self._moved(errors, there)
         changed = replace(fixed, objective=objective, lines=lines)
-        return self._shift(gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE, max_steps=STEPS))
+        begin = changed.assembled(start, there) if dropped is None else None
+        return self._shift(
+            gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE, max_steps=STEPS, begin=begin)
+        )
 
     def _moved(self, errors: Errors, lines: tuple[Linearisation, ...] = ()) -> tuple[Linearisation, ...]:
         """Lines, by default those at the estimate, with their residuals changed."""
