@@ -27,7 +27,6 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns.blocks import Acts, Block
 
 LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the block's own kernel: no mode is forbidden
-SEEN = 1e-13  # of the largest information, below which a direction is one that rounding makes
 FITTED = 0.5  # of a kind's residuals, the largest share that is taken for fitted by the unknowns
 
 LogEvidence = Callable[[NDArray[np.float64]], tuple[float, NDArray[np.float64]]]
@@ -143,7 +142,8 @@ class _Seen:
     def whitened(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """R (r, n) and t (r,) with A = R^T R and b = R^T t: the data's own directions, as many as they see."""
         sizes, vectors = linalg.eigh(self.information, check_finite=False)
-        kept = sizes >= max(SEEN * sizes[-1], np.finfo(np.float64).tiny)
+        number = np.finfo(np.float64)
+        kept = sizes > max(len(sizes) * number.eps * sizes[-1], number.tiny)  # beyond what rounding makes
         roots = np.sqrt(sizes[kept])
         return roots[:, None] * vectors[:, kept].T, vectors[:, kept].T @ self.pull / roots
 
@@ -153,10 +153,9 @@ def log_evidence(
 ) -> LogEvidence:
     """F = 1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) of C = sum_t v_t C_t, C_t (n, n) the terms of a prior.
 
-    A = R^T R and b = R^T t by a root R (r, n) and a target t (r,), dimensionless.
-
-    With D_t = R C_t R^T, K = sum_t v_t D_t and w = (1 + K)^-1 t it is 1/2 (w^T K t - ln det(1 + K)), its derivatives
-    dF / d v_t = 1/2 (w^T D_t w - tr (1 + K)^-1 D_t). A single D_t is made diagonal once for all variances.
+    A = R^T R and b = R^T t by a root R (r, n) and a target t (r,), dimensionless. With D_t = R C_t R^T, K = sum_t v_t D_t
+    and w = (1 + K)^-1 t it is 1/2 (w^T K t - ln det(1 + K)), its derivatives dF / d v_t = 1/2 (w^T D_t w - tr (1 +
+    K)^-1 D_t). A single D_t is made diagonal once for all variances.
     """
     seen = [root @ term @ root.T for term in terms]
     if len(seen) == 1:

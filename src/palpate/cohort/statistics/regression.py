@@ -137,29 +137,31 @@ class _Data:
         Values are integrated over the patient's own modulus in closed form; the probabilities of censored scans over
         what the values leave of it, by the trapezoidal rule.
         """
-        tau, omega = between**2, within**2
+        of_patients, of_scans = between**2, within**2  # variances
 
         def sums(of_values: Array) -> Array:
             """Of each patient (n,)."""
             return np.asarray(np.bincount(self.of_value, of_values, self.n), dtype=np.float64)
 
-        weights = 1.0 / (self.variances + omega)
-        slopes = -2.0 * omega * weights**2  # of the weights by ln within
+        weights = 1.0 / (self.variances + of_scans)
+        slopes = -2.0 * of_scans * weights**2  # of the weights by ln within
         precision, by_within = sums(weights), sums(slopes)
         some = np.maximum(precision, 1e-300)
         own = sums(weights * self.y) / some
         own_by_within = (sums(slopes * self.y) - own * by_within) / some
         squares = (self.y - own[self.of_value]) ** 2
-        shrunk, apart = 1.0 + precision * tau, own - mean
-        grows, kept = np.stack([2.0 * precision * tau, by_within * tau]), precision / shrunk
+        shrunk, apart = 1.0 + precision * of_patients, own - mean
+        grows, kept = np.stack([2.0 * precision * of_patients, by_within * of_patients]), precision / shrunk
         found = 0.5 * (sums(np.log(weights / (2.0 * np.pi)) - weights * squares) - np.log(shrunk) - apart**2 * kept)
         by_sd = -0.5 * grows / shrunk * (1.0 - apart**2 * kept)
         by_sd[1] += 0.5 * sums(slopes / weights - slopes * squares)
         by_sd[1] -= apart * own_by_within * kept + 0.5 * apart**2 * by_within / shrunk
         if not len(self.of_censored):
             return _LogLikelihood(found, apart * kept, by_sd)
-        centre, spread = (mean + tau * precision * own) / shrunk, between / np.sqrt(shrunk)
-        drawn = np.stack([2.0 * tau * precision * own, tau * (by_within * own + precision * own_by_within)])
+        centre, spread = (mean + of_patients * precision * own) / shrunk, between / np.sqrt(shrunk)
+        drawn = np.stack(
+            [2.0 * of_patients * precision * own, of_patients * (by_within * own + precision * own_by_within)]
+        )
         centres, spreads = (drawn - centre * grows) / shrunk, -0.5 * spread * grows / shrunk
         spreads[0] += spread
         held, of_held = np.unique(self.of_censored, return_inverse=True)
