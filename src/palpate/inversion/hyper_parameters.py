@@ -153,9 +153,9 @@ def log_evidence(
 ) -> LogEvidence:
     """F = 1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) of C = sum_t v_t C_t, C_t (n, n) the terms of a prior.
 
-    A = R^T R and b = R^T t by a root R (r, n) and a target t (r,), dimensionless. With D_t = R C_t R^T, K = sum_t v_t D_t
-    and w = (1 + K)^-1 t it is 1/2 (w^T K t - ln det(1 + K)), its derivatives dF / d v_t = 1/2 (w^T D_t w - tr (1 +
-    K)^-1 D_t). A single D_t is made diagonal once for all variances.
+    A = R^T R and b = R^T t by a root R (r, n) and a target t (r,), dimensionless. With D_t = R C_t R^T, w = (1 +
+    K)^-1 t and K = sum_t v_t D_t it is 1/2 (w^T K t - ln det(1 + K)), its derivatives dF / d v_t = 1/2 (w^T D_t w -
+    tr (1 + K)^-1 D_t). A single D_t is made diagonal once for all variances.
     """
     seen = [root @ term @ root.T for term in terms]
     if len(seen) == 1:
