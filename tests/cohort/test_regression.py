@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from palpate.cohort.statistics.association import association, permutation_test
-from palpate.cohort.statistics.regression import stage_regression
+from palpate.cohort.statistics.regression import PatientScans, stage_regression
 from palpate.cohort.statistics.scans import Scan
 
 GROWTH = 1.3
@@ -154,3 +154,30 @@ def test_tau_is_kendalls_and_takes_what_intervals_leave_open_as_ties():
     assert opened.tau == pytest.approx(
         2.0 / math.sqrt(2.0 * 3.0)
     )  # of three pairs two are told, both go with the stage
+
+
+def test_the_likelihoods_derivatives_are_those_of_differences():
+    """By each patient's mean and both scatters, of values and of intervals, also of ones without an end."""
+    rng = np.random.default_rng(8)
+    scans = PatientScans(
+        n=7,
+        y=rng.normal(3.0, 1.0, 9),
+        variances=rng.uniform(0.01, 0.2, 9),
+        of_value=np.array([0, 1, 1, 2, 3, 3, 4, 5, 0]),
+        lows=np.array([-np.inf, 1.0, 2.0, -1.0]),
+        highs=np.array([2.0, np.inf, 4.0, 1.5]),
+        of_censored=np.array([6, 6, 2, 5]),
+    )
+    mean, step = rng.normal(3.0, 0.5, 7), 1e-5
+
+    def slope(by):
+        """Central differences of the values (n,) along a change of the mean, ln between and ln within."""
+        ahead, behind = (
+            scans.log_likelihood(mean + s * by[0], 0.4 * np.exp(s * by[1]), 0.3 * np.exp(s * by[2])).values
+            for s in (step, -step)
+        )
+        return (ahead - behind) / (2.0 * step)
+
+    stated = scans.log_likelihood(mean, 0.4, 0.3)
+    assert stated.by_mean == pytest.approx(slope((1.0, 0.0, 0.0)), abs=1e-7)
+    assert stated.by_sd == pytest.approx(np.stack([slope((0.0, 1.0, 0.0)), slope((0.0, 0.0, 1.0))]), abs=1e-7)

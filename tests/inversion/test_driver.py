@@ -147,6 +147,19 @@ def test_what_is_not_seen_at_all_keeps_a_bounded_prior():
     assert variance.max() < 2.0 * (2.0 * 5.0 * 1.1) ** 2
 
 
+@pytest.mark.parametrize("n_terms", [1, 2])
+def test_where_nothing_is_seen_the_evidence_asks_for_nothing(n_terms, capfd):
+    """A block's prior is then as it begins, and no library complains."""
+    terms = tuple(np.diag([1.0, 2.0, 0.5]) ** (k + 1) for k in range(n_terms))
+    block = Block("b", "driver", Acts.BOUNDARY, (0,), np.eye(3), (terms,))
+    given = Objective((LaterState(None, ()),), ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, (block,)))
+    evaluation = SimpleNamespace(matrix=np.eye(3), prior=np.eye(3), score=np.zeros(3), prior_score=np.zeros(3))
+    found = hyper_parameters.with_amplitudes(given, evaluation, np.zeros(3))
+    believed = np.linalg.inv(found.parameters.nuisance_precision)
+    assert believed == pytest.approx(sum(terms), abs=0.01)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_walls_that_are_not_given_keep_the_modes_own_prior():
     own = unit_blocks(N_MODES)
     given = Objective((LaterState(None, ()),), ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, own))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.observation.noise_model import AT_ONCE, NEIGHBOURS, correlation, whitener
+from palpate.observation.noise_model import AT_ONCE, GROWTH, NEIGHBOURS, correlation, whitener
 
 
 def covariance_of(groups, length):
@@ -51,9 +51,13 @@ def test_its_size_grows_with_the_number_of_points():
 
 
 def test_more_means_than_are_looked_at_at_once_have_unit_variances_all():
-    groups = np.random.default_rng(6).uniform(0.0, 50.0, (5 * AT_ONCE, 1, 3))
+    groups = np.random.default_rng(6).uniform(0.0, 60.0, (10 * AT_ONCE, 1, 3))
+    assert (1.0 - 1.0 / GROWTH) * len(groups) > AT_ONCE  # means that are conditioned on those before them together
     mixed = whitener(groups, 5.0)
-    assert np.sum((mixed @ covariance_of(groups, 5.0)) * mixed.toarray(), axis=1) == pytest.approx(1.0, abs=1e-6)
+    for row in range(len(groups)):
+        entries = slice(*mixed.indptr[row : row + 2])
+        weights = mixed.data[entries]
+        assert weights @ covariance_of(groups[mixed.indices[entries]], 5.0) @ weights == pytest.approx(1.0, abs=1e-6)
 
 
 def test_points_that_stand_twice_in_a_mean_count_as_one(groups):

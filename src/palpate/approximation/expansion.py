@@ -79,10 +79,10 @@ class Expansion:
             if not found.converged:
                 raise NotConverged(f"no equilibrium near the estimate: {found.reason}")
             there = self._around(found)
-        few = there.model.n_regions + there.model.n_modes <= there.few
         if at.directions is None or at.metric is None:
             return there
-        directions = np.eye(len(at.directions)) if few else at.directions
+        every = there.model.n_regions + there.model.n_modes <= self.few
+        directions = np.eye(len(at.directions)) if every else at.directions
         known = there.model.derivatives @ directions
         change = there.equilibrium.tangent_along(directions, known) - known
         with determined():

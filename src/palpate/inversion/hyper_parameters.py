@@ -139,52 +139,54 @@ class _Seen:
     information: NDArray[np.float64]
     pull: NDArray[np.float64]
 
-    def whitened(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """R (r, n) and t (r,) with A = R^T R and b = R^T t: the data's own directions, as many as they see."""
+    def whitened(self) -> _Whitened:
+        """The same in the data's own directions: what rounding makes is left out, but for the one that is seen most."""
         sizes, vectors = linalg.eigh(self.information, check_finite=False)
         number = np.finfo(np.float64)
-        kept = sizes > max(len(sizes) * number.eps * sizes[-1], number.tiny)  # beyond what rounding makes
-        roots = np.sqrt(sizes[kept])
-        return roots[:, None] * vectors[:, kept].T, vectors[:, kept].T @ self.pull / roots
+        kept = sizes > len(sizes) * number.eps * sizes[-1]
+        kept[-1] = True
+        roots, axes = np.sqrt(np.maximum(sizes[kept], number.tiny)), vectors[:, kept].T
+        return _Whitened(roots[:, None] * axes, axes @ self.pull / roots)
 
 
-def log_evidence(
-    terms: Sequence[NDArray[np.float64]], root: NDArray[np.float64], target: NDArray[np.float64]
-) -> LogEvidence:
-    """F = 1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) of C = sum_t v_t C_t, C_t (n, n) the terms of a prior.
+@dataclass(frozen=True, slots=True)
+class _Whitened:
+    """Root R (r, n) and target t (r,), dimensionless, of an information A = R^T R and a pull b = R^T t."""
 
-    A = R^T R and b = R^T t by a root R (r, n) and a target t (r,), dimensionless. With D_t = R C_t R^T, w = (1 +
-    K)^-1 t and K = sum_t v_t D_t it is 1/2 (w^T K t - ln det(1 + K)), its derivatives dF / d v_t = 1/2 (w^T D_t w -
-    tr (1 + K)^-1 D_t). A single D_t is made diagonal once for all variances.
-    """
-    seen = [root @ term @ root.T for term in terms]
-    if len(seen) == 1:
-        sizes, axes = linalg.eigh(seen[0], check_finite=False) if len(root) else (np.zeros(0), np.zeros((0, 0)))
-        sizes, squares = np.maximum(sizes, 0.0), (axes.T @ target) ** 2
+    root: NDArray[np.float64]
+    target: NDArray[np.float64]
 
-        def of_one(variances: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-            """F and dF / dv (1,) at a variance (1,)."""
-            grown = 1.0 + variances[0] * sizes
-            value = 0.5 * float(np.sum(variances[0] * sizes * squares / grown - np.log(grown)))
-            return value, np.array([0.5 * float(np.sum(sizes * (squares / grown - 1.0) / grown))])
+    def log_evidence(self, terms: Sequence[NDArray[np.float64]]) -> LogEvidence:
+        """F = 1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) of C = sum_t v_t C_t, C_t (n, n) the terms of a prior.
 
-        return of_one
-    stack = np.stack(seen)
+        With D_t = R C_t R^T, K = sum_t v_t D_t and w = (1 + K)^-1 t it is 1/2 (w^T K t - ln det(1 + K)), its
+        derivatives dF / d v_t = 1/2 (w^T D_t w - tr (1 + K)^-1 D_t). A single D_t is made diagonal once for all v.
+        """
+        target, seen = self.target, np.stack([self.root @ term @ self.root.T for term in terms])
+        if len(seen) == 1:
+            sizes, axes = linalg.eigh(seen[0], check_finite=False)
+            sizes, squares = np.maximum(sizes, 0.0), (axes.T @ target) ** 2
 
-    def of_several(variances: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """F and dF / dv (n_terms,) at variances (n_terms,)."""
-        moved = np.tensordot(variances, stack, axes=1)
-        whole = moved.copy()
-        whole[np.diag_indices_from(whole)] += 1.0
-        factor = linalg.cholesky(whole, lower=True, overwrite_a=True, check_finite=False)
-        at_best = linalg.cho_solve((factor, True), target, check_finite=False)
-        determinant = 2.0 * float(np.sum(np.log(np.diag(factor))))
-        inverse, _ = linalg.lapack.dpotri(factor, lower=1, overwrite_c=1)  # its lower triangle
-        traces = 2.0 * np.einsum("tij,ij->t", stack, inverse) - np.einsum("tii,ii->t", stack, inverse)
-        slopes = 0.5 * (np.einsum("i,tij,j->t", at_best, stack, at_best, optimize=True) - traces)
-        return 0.5 * (float(at_best @ moved @ target) - determinant), slopes
+            def of_one(variances: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+                """F and dF / dv (1,) at a variance (1,)."""
+                grown = 1.0 + variances[0] * sizes
+                value = 0.5 * float(np.sum(variances[0] * sizes * squares / grown - np.log(grown)))
+                return value, np.array([0.5 * float(np.sum(sizes * (squares / grown - 1.0) / grown))])
 
-    return of_several
+            return of_one
+
+        def of_several(variances: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+            """F and dF / dv (n_terms,) at variances (n_terms,)."""
+            moved = np.tensordot(variances, seen, axes=1)
+            factor = linalg.cholesky(np.eye(len(target)) + moved, lower=True, overwrite_a=True, check_finite=False)
+            at_best = linalg.cho_solve((factor, True), target, check_finite=False)
+            determinant = 2.0 * float(np.sum(np.log(np.diag(factor))))
+            inverse, _ = linalg.lapack.dpotri(factor, lower=1, overwrite_c=1)  # its lower triangle
+            traces = 2.0 * np.einsum("tij,ij->t", seen, inverse) - np.einsum("tii,ii->t", seen, inverse)
+            slopes = 0.5 * (np.einsum("i,tij,j->t", at_best, seen, at_best, optimize=True) - traces)
+            return 0.5 * (float(at_best @ moved @ target) - determinant), slopes
+
+        return of_several
 
 
 def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
@@ -301,10 +303,8 @@ def _beliefs(
     data, prior: information and precision (n_unknowns, n_unknowns); pull (n_unknowns,): of data and prior means.
     """
     with determined():
-        seen = _seen(data + prior, data, pull, places)
-        data_space, odds = seen.whitened(), block.odds or (0.0,) * len(block.alternatives)
-        pairs = zip(block.alternatives, odds, strict=True)
-        return [_most_evident(terms, data_space, block, odd) for terms, odd in pairs]
+        seen, odds = _seen(data + prior, data, pull, places).whitened(), block.odds or (0.0,) * len(block.alternatives)
+        return [_most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)]
 
 
 def _seen(
@@ -326,14 +326,11 @@ def _seen(
 
 
 def _most_evident(
-    terms: Sequence[NDArray[np.float64]],
-    data_space: tuple[NDArray[np.float64], NDArray[np.float64]],
-    block: Block,
-    odds: float,
+    terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: Block, odds: float
 ) -> tuple[float, NDArray[np.float64]]:
     """The largest log-evidence, with its log prior odds, of a family of priors of a block; its covariance (n, n)."""
     floored = [term + LEAST_VARIANCE * np.eye(len(term)) for term in terms]
-    evidence = log_evidence(floored, *data_space)
+    evidence = seen.log_evidence(floored)
 
     def worse(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """Minus the log-evidence at ln of the amplitudes (n_terms,), with its derivative."""

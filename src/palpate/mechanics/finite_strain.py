@@ -346,14 +346,10 @@ class FiniteStrainEquilibrium:
         def along(directions: Array) -> Array:
             """Those of several directions."""
             of_moduli, of_modes, of_material = np.split(directions, ends)
-            forces = np.asarray(by_region @ of_moduli)
-            parts: list[tuple[Array, Callable[[Array], Array]]] = [
-                (of_modes, lambda part: np.asarray(stiffness @ np.asarray(self.model.constraint.modes @ part))),
-                (of_material, by_material.along),
-            ]
-            for part, along_part in parts:
-                some = part.any(axis=0)  # of unit vectors each has one of all parts
-                forces[:, some] += along_part(part[:, some])
+            forces, modes = np.asarray(by_region @ of_moduli), self.model.constraint.modes
+            moved, uneven = of_modes.any(axis=0), of_material.any(axis=0)  # of unit vectors each is of one part
+            forces[:, moved] += stiffness @ np.asarray(modes @ of_modes[:, moved])
+            forces[:, uneven] += by_material.along(of_material[:, uneven])
             return forces
 
         return along

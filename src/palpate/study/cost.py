@@ -156,10 +156,7 @@ def tets_by_edge_length(case: Case, before: Segmentation) -> Callable[[EdgeLengt
         away = ndimage.distance_transform_edt(~mask, sampling=cell)
         # inside, the nearest cell outside is no further than the first beside the tissue's box
         box_of = tuple(slice(max(p.min() - 1, 0), p.max() + 2) for p in np.nonzero(mask))
-        part = mask[box_of]
-        away[box_of] += (
-            ndimage.distance_transform_edt(part, sampling=cell) if not part.all() else np.where(part, np.inf, 0.0)
-        )
+        away[box_of] += ndimage.distance_transform_edt(mask[box_of], sampling=cell) if not mask.all() else np.inf
         distances[row] = np.maximum(away - 0.5 * float(cell.min()), 0.0)[meshed]
 
     def tets(lengths: EdgeLength) -> int:

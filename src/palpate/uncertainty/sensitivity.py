@@ -69,7 +69,8 @@ class FastPath:
 
         passes: see `refitted`, which also tells what is raised.
         """
-        moved = replace(self.least, evaluation=replace(self.least.evaluation, linearisations=self._moved(errors)))
+        there = _moved(self.least.evaluation.linearisations, errors)
+        moved = replace(self.least, evaluation=replace(self.least.evaluation, linearisations=there))
         return self._shift(refitted(self.fixed.objective, moved, self.bounds, max_steps=STEPS, passes=passes)[0])
 
     def shift(self, errors: Errors = (), *, width: float = 1.0, dropped: NDArray[np.bool_] | None = None) -> Shift:
@@ -88,21 +89,21 @@ class FastPath:
         objective = replace(fixed.objective, parameters=replace(parameters, nuisance_precision=precision))
         lines, there = fixed.lines, self.least.evaluation.linearisations
         if errors:
-            lines, there = self._moved(errors, lines), self._moved(errors, there)
+            lines, there = _moved(lines, errors), _moved(there, errors)
         changed = replace(fixed, objective=objective, lines=lines)
         begin = changed.assembled(start, there) if dropped is None else None
         return self._shift(
             gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE, max_steps=STEPS, begin=begin)
         )
 
-    def _moved(self, errors: Errors, lines: tuple[Linearisation, ...] = ()) -> tuple[Linearisation, ...]:
-        """Lines, by default those at the estimate, with their residuals changed."""
-        pairs = zip(lines or self.least.evaluation.linearisations, errors, strict=True)
-        return tuple(line.with_errors(error) for line, error in pairs)
-
     def _shift(self, found: Minimum) -> Shift:
         theta, least = (of.unknowns[: self.fixed.n_parameters] for of in (found, self.least))
         return Shift(theta - least, self.bounds.reached(theta), found.converged)
+
+
+def _moved(lines: Sequence[Linearisation], errors: Errors) -> tuple[Linearisation, ...]:
+    """Linearisations with their residuals changed."""
+    return tuple(line.with_errors(error) for line, error in zip(lines, errors, strict=True))
 
 
 def fast_path(objective: Objective, minimum: Minimum, bounds: Bounds) -> FastPath:

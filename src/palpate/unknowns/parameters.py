@@ -78,6 +78,7 @@ class _Layout:
         places = tuple(np.arange(*pair) for pair in pairwise(ends.tolist()))
 
         def joint(kept: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+            """Numbers (n,) of all of them, one after the other."""
             return np.concatenate([np.zeros(0, dtype=np.int64), *kept])
 
         pairs, states = list(zip(blocks, places, strict=True)), {state for block in blocks for state in block.states}
@@ -222,9 +223,8 @@ class ParameterMap:
         """
         logarithms = self.selection @ unknowns[: self.n_parameters]
         if len(unknowns) > self.n_parameters:
-            logarithms = logarithms + self._layout.of_regions @ in_series(
-                self._on_moduli(unknowns), self.shares_on_moduli
-            )
+            changes = in_series(self._on_moduli(unknowns), self.shares_on_moduli)
+            logarithms = logarithms + self._layout.of_regions @ changes
         moduli = np.asarray(self.base * np.exp(logarithms))
         for open_ in self.poisson:
             moduli[list(open_.regions)] *= open_.weights(unknowns)[0]

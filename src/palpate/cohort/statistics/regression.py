@@ -57,7 +57,9 @@ def stage_regression(
         words = f"all patients have the stage {x[0]:g}, and a regression needs two"
     if words:
         return {"undefined": f"undefined: {words}"}
-    regression = _Regression(_Data.of(kept, one), x - x.mean(), np.array([np.ones(len(x)), *beside.values()]).T, seed)
+    regression = _Regression(
+        PatientScans.of(kept, one), x - x.mean(), np.array([np.ones(len(x)), *beside.values()]).T, seed
+    )
     slope, fitted = regression.slope()
     found: dict[str, Any] = {
         "factor_per_stage": None if abs(slope) > 0.999 * regression.steepest else float(np.exp(slope)),
@@ -94,8 +96,21 @@ class _Fit:
 
 
 @dataclass(frozen=True, slots=True)
-class _Data:
-    """Scans of n patients: values y, their variances and patients' numbers; ends of the censored ones, and theirs."""
+class LogLikelihood:
+    """Of each patient (n,), with its derivatives by the mean (n,) and by ln `between` and ln `within` (2, n)."""
+
+    values: Array
+    by_mean: Array
+    by_sd: Array
+
+
+@dataclass(frozen=True, slots=True)
+class PatientScans:
+    """Scans of n patients, by ln E (kPa, or of a ratio).
+
+    y (n_values,): those with a value, their variances (n_values,) and whose they are, of_value (n_values,); lows, highs
+    (n_censored,): ends of the others, and whose these are, of_censored (n_censored,).
+    """
 
     n: int
     y: Array
@@ -106,7 +121,7 @@ class _Data:
     of_censored: NDArray[np.intp]
 
     @classmethod
-    def of(cls, scans: Sequence[Scan], patients: Sequence[str]) -> _Data:
+    def of(cls, scans: Sequence[Scan], patients: Sequence[str]) -> PatientScans:
         """Of scans whose patients are all among these."""
         number = {patient: i for i, patient in enumerate(patients)}
         valued = [scan for scan in scans if scan.value is not None]
@@ -131,7 +146,7 @@ class _Data:
         sums = np.bincount(patients, np.concatenate([self.y, ends]), self.n)
         return np.asarray(sums / np.bincount(patients, minlength=self.n))
 
-    def log_likelihood(self, mean: Array, between: float, within: float) -> _LogLikelihood:
+    def log_likelihood(self, mean: Array, between: float, within: float) -> LogLikelihood:
         """Of each patient, whose own ln E lies about `mean` (n,) with the standard deviation `between`.
 
         Values are integrated over the patient's own modulus in closed form; the probabilities of censored scans over
@@ -157,7 +172,7 @@ class _Data:
         by_sd[1] += 0.5 * sums(slopes / weights - slopes * squares)
         by_sd[1] -= apart * own_by_within * kept + 0.5 * apart**2 * by_within / shrunk
         if not len(self.of_censored):
-            return _LogLikelihood(found, apart * kept, by_sd)
+            return LogLikelihood(found, apart * kept, by_sd)
         centre, spread = (mean + of_patients * precision * own) / shrunk, between / np.sqrt(shrunk)
         drawn = np.stack(
             [2.0 * of_patients * precision * own, of_patients * (by_within * own + precision * own_by_within)]
@@ -184,23 +199,14 @@ class _Data:
         by_mean[held] += by_centre / shrunk[held]
         by_sd[:, held] += by_centre * centres[:, held] + by_spread * spreads[:, held]
         by_sd[1, held] += (shares * (member @ (ends[0] * densities[0] - ends[1] * densities[1]))).sum(axis=1)
-        return _LogLikelihood(found, by_mean, by_sd)
-
-
-@dataclass(frozen=True, slots=True)
-class _LogLikelihood:
-    """Of each patient (n,), with its derivatives by the mean (n,) and by ln `between` and ln `within` (2, n)."""
-
-    values: Array
-    by_mean: Array
-    by_sd: Array
+        return LogLikelihood(found, by_mean, by_sd)
 
 
 @dataclass(frozen=True, slots=True)
 class _Regression:
     """The regression of `data` on x (n,), without its mean, beside columns (n, k), the first of ones."""
 
-    data: _Data
+    data: PatientScans
     x: Array
     columns: Array
     seed: int
