@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from palpate.errors import ConfigurationError, NotConverged
 from palpate.mechanics.balance import TissueBalance
@@ -25,6 +26,7 @@ from palpate.mechanics.loads import Load
 from palpate.mechanics.material import HOMOGENEOUS, MaterialForces, MaterialModes, material_forces
 from palpate.mechanics.newton import NewtonPath, NewtonSettings, follow
 from palpate.mechanics.pattern import BlockPattern, Restriction, Stiffness, block_pattern, restriction
+from palpate.mechanics.solvers.conjugate_gradients import times
 from palpate.mechanics.solvers.contract import AT_ONCE, Factorisation
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 from palpate.mesh.constraint import Constraint
@@ -342,13 +344,16 @@ class FiniteStrainEquilibrium:
         """[dR / d ln E_r, K M, dR / dc_k] d (n_dof, k), mN, as a function of directions d (n_regions + n_modes, k)."""
         by_region, by_material = self.balance.region_forces(self.values, self.balance.moduli), self._by_material
         ends = np.cumsum([self.model.n_regions, self.model.constraint.n_modes])
+        modes = self.model.constraint.modes
+        moving = np.flatnonzero(modes.any(axis=1))  # what is prescribed, at the body's border: a small part
+        by_moving, modes = sparse.csr_matrix(stiffness.tocsr()[:, moving]), modes[moving]
 
         def along(directions: Array) -> Array:
             """Those of several directions."""
             of_moduli, of_modes, of_material = np.split(directions, ends)
-            forces, modes = np.asarray(by_region @ of_moduli), self.model.constraint.modes
+            forces = np.asarray(by_region @ of_moduli)
             moved, uneven = of_modes.any(axis=0), of_material.any(axis=0)  # of unit vectors each is of one part
-            forces[:, moved] += stiffness @ np.asarray(modes @ of_modes[:, moved])
+            forces[:, moved] += times(by_moving, np.asarray(modes @ of_modes[:, moved]))
             forces[:, uneven] += by_material.along(of_material[:, uneven])
             return forces
 

@@ -23,7 +23,8 @@ from palpate.parallel import mapped
 
 Array = NDArray[np.float64]
 
-CHUNK = 2048  # elements at once: some 15 MB of tangents at their quadrature points
+CHUNK = 2048  # elements at once, where a few numbers are made of each
+FEW = 128  # elements at once whose blocks are made: what they take stays in a core's cache, three times as fast
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +128,7 @@ class Elements:
             weighted = stress.reshape(n, n_q, 3, 3) * (self.volumes[part, None] * self.weights[part])[:, :, None, None]
             result[part] = (self._stacked(part) @ np.swapaxes(weighted, 2, 3).reshape(n, -1, 3)).reshape(n, -1, 3)
 
-        mapped(fill, self._parts())
+        mapped(fill, self._parts(CHUNK))
         return result
 
     def pressure_ahead(self, displacement: Array, change: Array, moduli: Moduli) -> Array:
@@ -158,20 +159,22 @@ class Elements:
             tangent *= (self.volumes[part, None] * weights).reshape(-1, 1)
             stacked = self._stacked(part)
             by_second = tangent.reshape(n, n_q, 3, 3, 3, 3).transpose(0, 1, 3, 2, 4, 5).reshape(n, n_q, 27, 3)
-            half = by_second @ np.swapaxes(self.gradients[part], 2, 3)
-            blocks = stacked @ half.reshape(n, n_q * 3, 9 * n_a)
-            result[part] = blocks.reshape(n, n_a, 3, 3, n_a).transpose(0, 1, 4, 2, 3)
-            if np.any(own.mean):
+            half = (by_second @ np.swapaxes(self.gradients[part], 2, 3)).reshape(n, n_q * 3, 9 * n_a)
+            if np.any(own.mean):  # dJ_mean/du_ai times what stiffens dJ_mean/du_bk: three further rows, i by i
                 weighted = gradient.reshape(n, n_q, 3, 3) * weights[:, :, None, None]
                 slope = stacked @ np.swapaxes(weighted, 2, 3).reshape(n, -1, 3)
                 size = self.volumes[part] * own.mean * self.law.bulk_stiffness((volume * weights).sum(axis=1))
-                result[part] += np.einsum("n,nai,nbk->nabik", size, slope, slope, optimize=True)
+                rows = np.eye(3)[:, :, None, None] * (size[:, None, None] * np.swapaxes(slope, 1, 2))[:, None, None]
+                stacked = np.concatenate([stacked, slope], axis=2)
+                half = np.concatenate([half, rows.reshape(n, 3, 9 * n_a)], axis=1)
+            blocks = stacked @ half
+            result[part] = blocks.reshape(n, n_a, 3, 3, n_a).transpose(0, 1, 4, 2, 3)
 
-        mapped(fill, self._parts())
+        mapped(fill, self._parts(FEW))
         return result.reshape(-1, 9)
 
-    def _parts(self) -> Iterator[slice]:
-        return (slice(start, start + CHUNK) for start in range(0, len(self.cells), CHUNK))
+    def _parts(self, size: int) -> Iterator[slice]:
+        return (slice(start, start + size) for start in range(0, len(self.cells), size))
 
     def _stacked(self, part: slice) -> Array:
         """Shape gradients (n, n_a, n_q * 3), quadrature points side by side."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from palpate.mechanics.solvers.conjugate_gradients import times
 from palpate.mesh.constraint import Constraint
 
 Stiffness: TypeAlias = "sparse.bsr_matrix[np.float64] | sparse.csr_matrix[np.float64]"  # in blocks of points, or not
@@ -28,7 +29,7 @@ class BlockPattern:
 
     def assemble(self, blocks: NDArray[np.float64]) -> sparse.bsr_matrix[np.float64]:
         """Matrix (3 n_points, 3 n_points), mN/mm, of element blocks (n_cells * n_a * n_a, 9) mN/mm."""
-        data = np.asarray(self.gather @ blocks).reshape(-1, 3, 3)
+        data = times(self.gather, blocks).reshape(-1, 3, 3)
         size = 3 * (len(self.indptr) - 1)
         return sparse.bsr_matrix((data, self.indices, self.indptr), shape=(size, size))
 

@@ -25,6 +25,7 @@ REACH = 28.0  # mm
 BINS = 1 + int(REACH)  # of a cell with itself, then of 1 mm each
 FLOOR = 1e-3  # mm: no surface in an image is known better
 SMOOTH = 4.0  # mm: errors that are correlated over less are hardly taken for motion
+FAR = 3.5  # correlation lengths, beyond which errors are taken for independent
 WITHIN = 0.75  # correlation lengths: errors so near are summed before a fit answers to them
 RESPONSE_CELLS = 800  # of a surface, on which what a fit leaves is seen
 NEIGHBOURS = 12
@@ -69,12 +70,7 @@ class NoiseModel:
         def term(of: tuple[float, float]) -> NDArray[np.float64]:
             """That of one variance and its length."""
             variance, length = of
-            centres, carried = _carried(rows, places, normals, 0.5 * length)
-            i, j = cKDTree(centres).query_pairs(3.5 * length, output_type="ndarray").T
-            apart = np.sqrt(sum((x[i] - x[j]) ** 2 for x in np.ascontiguousarray(centres.T)))
-            once = sparse.coo_matrix((_gaussian(apart, length), (i, j)), shape=(len(centres),) * 2)
-            across = sum((part @ _times(once, part.T) for part in carried), np.zeros((len(rows),) * 2))
-            return variance * (across + across.T + sum((part @ part.T for part in carried), np.zeros(across.shape)))
+            return variance * _correlated(*_carried(rows, places, normals, 0.5 * length), length)
 
         return np.asarray(np.sum(mapped(term, zip(self.variances, self.lengths, strict=True)), axis=0))
 
@@ -122,13 +118,14 @@ class FitResponse:
     def _products(self, length: float, seen: Sequence[_Pairs]) -> NDArray[np.float64]:
         """Sums (BINS,) of what is left in each pair, times n_i.n_j."""
         centres, carried = self._carried(WITHIN * length)
-        kernel = _gaussian_between(centres, centres, length)
-        n_unknowns = self.gains[0].shape[1]
-        by_errors = sum(((part @ kernel) @ part.T for part in carried), np.zeros((n_unknowns, n_unknowns)))  # G K G^T
+        by_errors, tree = _correlated(centres, carried, length), cKDTree(centres)  # G K G^T
         products = np.zeros(BINS)
         for pairs in seen:
-            across = _gaussian_between(centres, pairs.places, length)
-            pulled = sum(((part @ across) * pairs.normals[:, a] for a, part in enumerate(carried)), np.zeros(()))  # G K
+            near = cKDTree(pairs.places).sparse_distance_matrix(tree, FAR * length, output_type="coo_matrix").tocsr()
+            near.data = _gaussian(near.data, length)
+            pulled = sum(
+                (_times(near, part.T).T * pairs.normals[:, a] for a, part in enumerate(carried)), np.zeros(())
+            )  # G K
             taken = pairs.jacobian @ (pulled - 0.5 * by_errors @ pairs.jacobian.T)
             left = _gaussian(pairs.distance, length) * pairs.cosine - (taken + taken.T)[pairs.near]
             products += np.bincount(pairs.bins, left * pairs.cosine, minlength=BINS)
@@ -273,11 +270,15 @@ def _gaussian(distance: NDArray[np.float64], length: float) -> NDArray[np.float6
     return np.asarray(np.exp(-(distance**2) / (2.0 * length**2)))
 
 
-def _gaussian_between(one: NDArray[np.float64], other: NDArray[np.float64], length: float) -> NDArray[np.float64]:
-    """That correlation (n, m) between places (n, 3) and (m, 3) mm, made in place: it is the largest thing here."""
-    kernel = cdist(one, other, "sqeuclidean")
-    kernel *= -0.5 / length**2
-    return np.asarray(np.exp(kernel, out=kernel))
+def _correlated(
+    centres: NDArray[np.float64], carried: Sequence[NDArray[np.float64]], length: float
+) -> NDArray[np.float64]:
+    """Sum over axes of A K A^T (n_rows, n_rows), A = `carried` (n_rows, n_cells), of cells at centres (n_cells, 3) mm."""
+    i, j = cKDTree(centres).query_pairs(FAR * length, output_type="ndarray").T
+    apart = np.sqrt(sum((x[i] - x[j]) ** 2 for x in np.ascontiguousarray(centres.T)))
+    once = sparse.coo_matrix((_gaussian(apart, length), (i, j)), shape=(len(centres),) * 2)
+    parts = [(part @ _times(once, part.T), part @ part.T) for part in carried]
+    return np.asarray(sum((across + across.T + own for across, own in parts), np.zeros(())))
 
 
 def _units(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
