@@ -273,7 +273,7 @@ def _gaussian(distance: NDArray[np.float64], length: float) -> NDArray[np.float6
 def _correlated(
     centres: NDArray[np.float64], carried: Sequence[NDArray[np.float64]], length: float
 ) -> NDArray[np.float64]:
-    """Sum over axes of A K A^T (n_rows, n_rows), A = `carried` (n_rows, n_cells) of cells at centres (n_cells, 3) mm."""
+    """Sum over axes of A K A^T (n_rows, n_rows), A = `carried` (n_rows, n_cells), cells at centres (n_cells, 3) mm."""
     i, j = cKDTree(centres).query_pairs(FAR * length, output_type="ndarray").T
     apart = np.sqrt(sum((x[i] - x[j]) ** 2 for x in np.ascontiguousarray(centres.T)))
     once = sparse.coo_matrix((_gaussian(apart, length), (i, j)), shape=(len(centres),) * 2)
