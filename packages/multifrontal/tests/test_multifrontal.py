@@ -13,6 +13,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 import multifrontal
 from multifrontal import NotPositiveDefinite, dense, plan, symbolic
+from multifrontal.numeric import CACHE
 from multifrontal.plan import make_plan
 
 
@@ -105,6 +106,16 @@ def test_single_precision_is_near_and_refined_by_conjugate_gradients(body):
 def test_one_right_hand_side_may_be_a_vector(body):
     factor, rhs = multifrontal.factorise(body), np.random.default_rng(2).standard_normal((body.shape[0], 3))
     assert np.allclose(factor.solve(rhs[:, 1]), factor.solve(rhs)[:, 1], rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("columns", [1, 2, 6, 7])
+def test_fronts_larger_than_the_cache_serve_any_number_of_right_hand_sides(columns):
+    matrix = stiffness(cube(11), np.full(1331, 3), 9)
+    plan = make_plan(matrix, 2)
+    cut = [front for front in plan.fronts if 8 * front.size * front.width > 2 * CACHE]
+    assert any(len(front.rows) for front in cut)
+    rhs = np.random.default_rng(4).standard_normal((matrix.shape[0], columns))
+    assert relative_residual(matrix, multifrontal.factorise(matrix, plan=plan).solve(rhs), rhs) < 1e-11
 
 
 def test_columns_instead_of_rows_are_taken_too(body):

@@ -27,14 +27,14 @@ from scipy.linalg import cython_blas, cython_lapack
 
 __all__ = [
     "Matrix",
+    "Vectors",
+    "address",
     "blas_on_one_thread",
     "factor",
     "pool_of",
     "processors",
     "solve_right",
     "solve_transposed",
-    "solve_vector",
-    "subtract_from_vector",
     "subtract_product",
     "subtract_square",
 ]
@@ -69,9 +69,10 @@ _CONSTANT = {(dtype, value): np.array([value], dtype=dtype) for dtype in _TYPES 
 _PLACES = {key: constant.ctypes.data for key, constant in _CONSTANT.items()}
 
 
-# A factor has thousands of small fronts: what surrounds a call counts as much as the call.
-def _at(array: Matrix) -> int:
-    return array.ctypes.data
+# A factor has hundreds of small fronts: what surrounds a call counts as much as the call.
+def address(array: Matrix) -> int:
+    """Where the first of its numbers lies."""
+    return int(array.ctypes.data)
 
 
 @functools.lru_cache(maxsize=1 << 14)
@@ -90,14 +91,14 @@ def _scalar(dtype: np.dtype[Any], value: float) -> int:
 def factor(a: Matrix) -> int:
     """L in place of the lower triangle of A = L L^T (n, n); 0, or the number from 1 of the first bad pivot."""
     info = ctypes.c_int(0)
-    _ROUTINES["potrf", a.dtype](b"L", _dimension(len(a)), _at(a), _leading(a), ctypes.byref(info))
+    _ROUTINES["potrf", a.dtype](b"L", _dimension(len(a)), address(a), _leading(a), ctypes.byref(info))
     return info.value
 
 
 def _triangular(side: bytes, transposed: bytes, lower: Matrix, b: Matrix) -> None:
     _ROUTINES["trsm", b.dtype](
         side, b"L", transposed, b"N", _dimension(b.shape[0]), _dimension(b.shape[1]), _scalar(b.dtype, 1.0),
-        _at(lower), _leading(lower), _at(b), _leading(b),
+        address(lower), _leading(lower), address(b), _leading(b),
     )  # fmt: skip
 
 
@@ -114,8 +115,8 @@ def solve_right(lower: Matrix, b: Matrix) -> None:
 def subtract_square(c: Matrix, a: Matrix, *, keep: float = 1.0) -> None:
     """Keep C - A A^T in place of the lower triangle of C (n, n), A (n, k); keep: 0 or 1."""
     _ROUTINES["syrk", c.dtype](
-        b"L", b"N", _dimension(a.shape[0]), _dimension(a.shape[1]), _scalar(c.dtype, -1.0), _at(a), _leading(a),
-        _scalar(c.dtype, keep), _at(c), _leading(c),
+        b"L", b"N", _dimension(a.shape[0]), _dimension(a.shape[1]), _scalar(c.dtype, -1.0), address(a), _leading(a),
+        _scalar(c.dtype, keep), address(c), _leading(c),
     )  # fmt: skip
 
 
@@ -123,23 +124,43 @@ def subtract_product(c: Matrix, a: Matrix, b: Matrix, *, transposed: bool = True
     """Keep C - A B^T in place of C (m, n), A (m, k), B (n, k), or with A B, B (k, n); keep: 0 or 1."""
     _ROUTINES["gemm", c.dtype](
         b"N", b"T" if transposed else b"N", _dimension(c.shape[0]), _dimension(c.shape[1]), _dimension(a.shape[1]),
-        _scalar(c.dtype, -1.0), _at(a), _leading(a), _at(b), _leading(b), _scalar(c.dtype, keep), _at(c), _leading(c),
+        _scalar(c.dtype, -1.0), address(a), _leading(a), address(b), _leading(b), _scalar(c.dtype, keep), address(c),
+        _leading(c),
     )  # fmt: skip
 
 
-def solve_vector(lower: Matrix, x: Matrix, *, transposed: bool) -> None:
-    """L^-1 x, or L^-T x, in place of x (n,)."""
-    _ROUTINES["trsv", x.dtype](
-        b"L", b"T" if transposed else b"N", b"N", _dimension(len(x)), _at(lower), _leading(lower), _at(x), _dimension(1)
-    )
+@dataclass(frozen=True, slots=True)
+class Vectors:
+    """Products of parts of a matrix with single vectors, told by addresses: views would cost more than the products.
 
+    trsv, gemv: routines of one type; minus, zero, one: addresses of these numbers.
+    """
 
-def subtract_from_vector(y: Matrix, a: Matrix, x: Matrix, *, transposed: bool) -> None:
-    """The difference y - A x, or y - A^T x, in place of y; A (m, n)."""
-    _ROUTINES["gemv", x.dtype](
-        b"T" if transposed else b"N", _dimension(a.shape[0]), _dimension(a.shape[1]), _scalar(x.dtype, -1.0),
-        _at(a), _leading(a), _at(x), _dimension(1), _scalar(x.dtype, 1.0), _at(y), _dimension(1),
-    )  # fmt: skip
+    trsv: Callable[..., None]
+    gemv: Callable[..., None]
+    minus: int
+    zero: int
+    one: int
+
+    @classmethod
+    def of(cls, dtype: np.dtype[Any]) -> Vectors:
+        """Those of matrices of single or of double precision."""
+        return cls(
+            _ROUTINES["trsv", dtype], _ROUTINES["gemv", dtype], *(_scalar(dtype, value) for value in (-1.0, 0.0, 1.0))
+        )
+
+    def solve(self, transposed: bool, n: int, lower: int, leading: int, x: int) -> None:
+        """L^-1 x, or L^-T x, in place of x (n,), L (n, n)."""
+        self.trsv(b"L", b"T" if transposed else b"N", b"N", _dimension(n), lower, _dimension(leading), x, _dimension(1))
+
+    def subtract(
+        self, transposed: bool, shape: tuple[int, int], a: int, leading: int, x: int, y: int, *, keep: bool
+    ) -> None:
+        """Keep y - A x, or y - A^T x, in place of y; A of `shape` (m, n)."""
+        self.gemv(
+            b"T" if transposed else b"N", _dimension(shape[0]), _dimension(shape[1]), self.minus, a,
+            _dimension(leading), x, _dimension(1), self.one if keep else self.zero, y, _dimension(1),
+        )  # fmt: skip
 
 
 def processors() -> int:

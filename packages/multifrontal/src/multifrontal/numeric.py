@@ -22,9 +22,8 @@ __all__ = ["NotPositiveDefinite", "factorised", "substituted"]
 
 BLOCK = 256  # columns of a large front that are eliminated before the others hear of them
 Everywhere = Callable[[Callable[[Any], None], Iterable[Any]], None]
-FEW = 6  # right-hand sides of a thread up to which a large front, once in the cache, is best met by one at a time
-WIDE = 96  # columns of such a front
-ALONE = 4  # right-hand sides up to which threads would wait for Python's lock longer than they compute
+FEW = 6  # right-hand sides up to which one at a time is fastest: the products of several have no kernel for so few
+CACHE = 1 << 19  # bytes of a front that are met by all of these while they lie in the cache
 LARGEST_BLOCK = 64  # right-hand sides of a thread; more at once are not faster and take more memory
 
 
@@ -190,13 +189,89 @@ def substituted(plan: Plan, factor: Matrix, rhs: NDArray[np.float64]) -> NDArray
     ends = np.linspace(0, m, max(-(-m // (LARGEST_BLOCK * threads)), 1) + 1).astype(int).tolist()
     for begin, end in pairwise(ends):
         x = np.ascontiguousarray(rhs[plan.order, begin:end], dtype=factor.dtype)
-        if threads == 1 or end - begin <= ALONE:
+        if end - begin <= FEW:
+            x = _one_by_one(plan, factor, x)
+        elif threads == 1:
             _forward(plan.fronts, factor, x)
             _backward(plan.fronts, factor, x)
         else:
             _side_by_side(plan, factor, x)
         result[plan.order, begin:end] = x
     return result
+
+
+def _one_by_one(plan: Plan, factor: Matrix, rhs: Matrix) -> Matrix:
+    """L^-T L^-1 rhs (n, m) of few right-hand sides, in the order of elimination, by one thread.
+
+    Threads would wait for Python's lock longer than they compute.
+    """
+    x = np.ascontiguousarray(rhs.T)
+    above = np.empty((len(x), max(len(front.rows) for front in plan.fronts)), x.dtype)
+    places = tuple((dense.address(own), dense.address(rows)) for own, rows in zip(x, above, strict=True))
+    few = _Few(dense.Vectors.of(factor.dtype), dense.address(factor), factor.itemsize, tuple(x), tuple(above), places)
+    for front in plan.fronts:
+        few.forward(front)
+    for front in reversed(plan.fronts):
+        few.backward(front)
+    return x.T
+
+
+@dataclass(frozen=True, slots=True)
+class _Few:
+    """Few right-hand sides x (m of (n,)), met by a front one at a time, in parts of it that the cache holds meanwhile.
+
+    above (m of (n_rows,)): what a front does to its rows, or has of them; places: addresses of x and above; factor: of
+    the factor, its numbers of `item` bytes.
+    """
+
+    vectors: dense.Vectors
+    factor: int
+    item: int
+    x: tuple[Matrix, ...]
+    above: tuple[Matrix, ...]
+    places: tuple[tuple[int, int], ...]
+
+    def forward(self, front: Front) -> None:
+        """What L^-1 does by this front."""
+        size, below = front.size, len(front.rows)
+        for begin, end, corner in self._parts(front):
+            n, rest, ahead = end - begin, front.width - end, self.item * (end - begin)
+            for own, change in self.places:
+                here = own + self.item * (front.first + begin)
+                self.vectors.solve(False, n, corner, size, here)
+                if rest:
+                    self.vectors.subtract(False, (rest, n), corner + ahead, size, here, here + ahead, keep=True)
+                if below:
+                    rows = corner + self.item * (front.width - begin)
+                    self.vectors.subtract(False, (below, n), rows, size, here, change, keep=begin > 0)
+        if below:
+            for x, above in zip(self.x, self.above, strict=True):  # both axes at once would take twice as long
+                x[front.rows] += above[:below]
+
+    def backward(self, front: Front) -> None:
+        """What L^-T does by this front."""
+        size, below = front.size, len(front.rows)
+        for x, above in zip(self.x, self.above, strict=True):
+            above[:below] = x[front.rows]
+        for begin, end, corner in reversed(self._parts(front)):
+            n, rest, ahead = end - begin, front.width - end, self.item * (end - begin)
+            for own, held in self.places:
+                here = own + self.item * (front.first + begin)
+                if below:
+                    rows = corner + self.item * (front.width - begin)
+                    self.vectors.subtract(True, (below, n), rows, size, held, here, keep=True)
+                if rest:
+                    self.vectors.subtract(True, (rest, n), corner + ahead, size, here + ahead, here, keep=True)
+                self.vectors.solve(True, n, corner, size, here)
+
+    def _parts(self, front: Front) -> list[tuple[int, int, int]]:
+        """First and last columns that are met together, and where their part of the diagonal begins."""
+        at_once = front.width if len(self.x) == 1 else max(CACHE // (self.item * front.size), 1)
+        first = self.factor + self.item * front.panel
+        return [
+            (begin, min(begin + at_once, front.width), first + self.item * begin * (front.size + 1))
+            for begin in range(0, front.width, at_once)
+        ]
 
 
 def _side_by_side(plan: Plan, factor: Matrix, x: Matrix) -> None:
@@ -231,19 +306,11 @@ def _forward(fronts: Iterable[Front], factor: Matrix, x: Matrix) -> None:
     """What L^-1 does to X (n, m) by these fronts, children before their parents."""
     for front in fronts:
         panel, own = panel_of(factor, front), x[front.first : front.first + front.width]
-        triangle, rest, m = panel[: front.width], panel[front.width :], x.shape[1]
-        if m == 1 or (m <= FEW and front.width >= WIDE):
-            columns, change = np.asfortranarray(own), np.zeros((len(rest), m), x.dtype, order="F")
-            for k in range(m):
-                dense.solve_vector(triangle, columns[:, k], transposed=False)
-                if len(rest):
-                    dense.subtract_from_vector(change[:, k], rest, columns[:, k], transposed=False)
-            own[:] = columns
-        else:
-            dense.solve_transposed(triangle, own.T)
-            change = np.empty((len(rest), m), x.dtype)
-            if len(rest):
-                dense.subtract_product(change.T, own.T, rest, keep=0.0)
+        triangle, rest = panel[: front.width], panel[front.width :]
+        dense.solve_transposed(triangle, own.T)
+        change = np.empty((len(rest), x.shape[1]), x.dtype)
+        if len(rest):
+            dense.subtract_product(change.T, own.T, rest, keep=0.0)
         x[front.rows] += change
 
 
@@ -251,15 +318,7 @@ def _backward(fronts: Iterable[Front], factor: Matrix, x: Matrix) -> None:
     """What L^-T does to X (n, m) by these fronts, parents before their children."""
     for front in reversed(tuple(fronts)):
         panel, own = panel_of(factor, front), x[front.first : front.first + front.width]
-        triangle, rest, m = panel[: front.width], panel[front.width :], x.shape[1]
-        if m == 1 or (m <= FEW and front.width >= WIDE):
-            columns, below = np.asfortranarray(own), np.asfortranarray(x[front.rows])
-            for k in range(m):
-                if len(rest):
-                    dense.subtract_from_vector(columns[:, k], rest, below[:, k], transposed=True)
-                dense.solve_vector(triangle, columns[:, k], transposed=True)
-            own[:] = columns
-        else:
-            if len(rest):
-                dense.subtract_product(own.T, x[front.rows].T, rest, transposed=False)
-            dense.solve_right(triangle, own.T)
+        triangle, rest = panel[: front.width], panel[front.width :]
+        if len(rest):
+            dense.subtract_product(own.T, x[front.rows].T, rest, transposed=False)
+        dense.solve_right(triangle, own.T)
