@@ -164,15 +164,14 @@ def what_would_change(
         if each.cause != "poisson_ratio" or each.subject == ALL
     ]
 
-    def shifted(each: _Input, amount: float, words: str) -> Variation:
-        """Under the estimate's weights."""
-        change = partial(path.shift, tuple(amount * error for error in each.errors))
-        return _stated(names, (each.cause, each.subject, words), change)
-
-    found = [*_exact(inversion, tissues), *(shifted(each, *amount) for each in inputs for amount in each.amounts)]
+    changes: list[tuple[tuple[str, str, str], Callable[[], Shift]]] = [
+        ((each.cause, each.subject, words), partial(path.shift, tuple(amount * error for error in each.errors)))
+        for each in inputs
+        for amount, words in each.amounts
+    ]
     frame = np.concatenate([np.zeros(0, dtype=bool), *(np.full(b.size, b.cause == "frame") for b in blocks)])
     if frame.any():
-        found.append(_stated(names, ("frame", "", "held still"), partial(path.shift, dropped=frame)))
+        changes.append((("frame", "", "held still"), partial(path.shift, dropped=frame)))
 
     def under(law: Law) -> Callable[[], Shift]:
         """What a step to another law's equilibrium does."""
@@ -181,7 +180,8 @@ def what_would_change(
     bound = inversion.objective.parameters.poisson or any(
         isinstance(o, OfMaterial) for o in inversion.objective.observations
     )
-    return (*found, *(_stated(names, ("law", "", law.name), under(law)) for law in laws if not bound))
+    changes += [(("law", "", law.name), under(law)) for law in laws if not bound]
+    return (*_exact(inversion, tissues), *mapped(lambda change: _stated(names, *change), changes))
 
 
 def sobol_result(
