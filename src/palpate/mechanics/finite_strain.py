@@ -37,6 +37,7 @@ Array = NDArray[np.float64]
 FACTORISATION_IN_SOLVES = 30  # right-hand sides that cost as much as a factorisation
 NEARLY_INCOMPRESSIBLE = 0.4999  # no coefficient leads Poisson's ratio beyond
 LACKING = 1e-2  # relative residual of a correction to derivatives of a like state
+ESTIMATED = 1e-4  # relative residual of a correction by another state's stiffness
 REFINEMENTS = 12  # solutions with an old factorisation that an exact one takes
 
 
@@ -260,7 +261,7 @@ class FiniteStrainEquilibrium:
         if self.factorisation is None or balance.smallest_volume(displacement) <= 0.0:
             return np.inf, np.zeros_like(displacement)
         residual = np.asarray(balance.free.T @ balance.residual(displacement)[0])
-        correction = -self.factorisation.solve(residual[:, None])[:, 0]
+        correction = -self.factorisation.solve(residual[:, None], tolerance=ESTIMATED)[:, 0]
         internal = balance.region_forces(displacement, balance.moduli).sum(axis=1)
         squared = abs(residual @ correction) / max(abs(float(internal @ displacement)), np.finfo(float).tiny)
         missing = np.asarray(balance.free @ correction)
