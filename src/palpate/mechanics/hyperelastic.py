@@ -24,7 +24,7 @@ from palpate.parallel import mapped
 Array = NDArray[np.float64]
 
 CHUNK = 2048  # elements at once, where a few numbers are made of each
-FEW = 128  # elements at once whose blocks are made: what they take stays in a core's cache, three times as fast
+STIFFNESS_CHUNK = 128  # where a stiffness is: what it takes stays in a core's cache, in half of the time
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +170,7 @@ class Elements:
             blocks = stacked @ half
             result[part] = blocks.reshape(n, n_a, 3, 3, n_a).transpose(0, 1, 4, 2, 3)
 
-        mapped(fill, self._parts(FEW))
+        mapped(fill, self._parts(STIFFNESS_CHUNK))
         return result.reshape(-1, 9)
 
     def _parts(self, size: int) -> Iterator[slice]:

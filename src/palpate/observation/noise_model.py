@@ -25,7 +25,7 @@ REACH = 28.0  # mm
 BINS = 1 + int(REACH)  # of a cell with itself, then of 1 mm each
 FLOOR = 1e-3  # mm: no surface in an image is known better
 SMOOTH = 4.0  # mm: errors that are correlated over less are hardly taken for motion
-FAR = 3.5  # correlation lengths, beyond which errors are taken for independent
+CUTOFF = 3.5  # correlation lengths, beyond which errors are taken for independent
 WITHIN = 0.75  # correlation lengths: errors so near are summed before a fit answers to them
 RESPONSE_CELLS = 800  # of a surface, on which what a fit leaves is seen
 NEIGHBOURS = 12
@@ -121,11 +121,10 @@ class FitResponse:
         by_errors, tree = _correlated(centres, carried, length), cKDTree(centres)  # G K G^T
         products = np.zeros(BINS)
         for pairs in seen:
-            near = cKDTree(pairs.places).sparse_distance_matrix(tree, FAR * length, output_type="coo_matrix").tocsr()
+            near = cKDTree(pairs.places).sparse_distance_matrix(tree, CUTOFF * length, output_type="coo_matrix").tocsr()
             near.data = _gaussian(near.data, length)
-            pulled = sum(
-                (_times(near, part.T).T * pairs.normals[:, a] for a, part in enumerate(carried)), np.zeros(())
-            )  # G K
+            along = [_times(near, part.T).T * pairs.normals[:, a] for a, part in enumerate(carried)]
+            pulled = np.sum(along, axis=0)  # G K
             taken = pairs.jacobian @ (pulled - 0.5 * by_errors @ pairs.jacobian.T)
             left = _gaussian(pairs.distance, length) * pairs.cosine - (taken + taken.T)[pairs.near]
             products += np.bincount(pairs.bins, left * pairs.cosine, minlength=BINS)
@@ -274,7 +273,7 @@ def _correlated(
     centres: NDArray[np.float64], carried: Sequence[NDArray[np.float64]], length: float
 ) -> NDArray[np.float64]:
     """Sum over axes of A K A^T (n_rows, n_rows), A = `carried` (n_rows, n_cells), cells at centres (n_cells, 3) mm."""
-    i, j = cKDTree(centres).query_pairs(FAR * length, output_type="ndarray").T
+    i, j = cKDTree(centres).query_pairs(CUTOFF * length, output_type="ndarray").T
     apart = np.sqrt(sum((x[i] - x[j]) ** 2 for x in np.ascontiguousarray(centres.T)))
     once = sparse.coo_matrix((_gaussian(apart, length), (i, j)), shape=(len(centres),) * 2)
     parts = [(part @ _times(once, part.T), part @ part.T) for part in carried]

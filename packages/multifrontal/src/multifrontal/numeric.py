@@ -234,7 +234,7 @@ class _Few:
     def forward(self, front: Front) -> None:
         """What L^-1 does by this front."""
         size, below = front.size, len(front.rows)
-        for begin, end, corner in self._parts(front):
+        for begin, end, corner in self._stretches(front):
             n, rest, ahead = end - begin, front.width - end, self.item * (end - begin)
             for own, change in self.places:
                 here = own + self.item * (front.first + begin)
@@ -253,7 +253,7 @@ class _Few:
         size, below = front.size, len(front.rows)
         for x, above in zip(self.x, self.above, strict=True):
             above[:below] = x[front.rows]
-        for begin, end, corner in reversed(self._parts(front)):
+        for begin, end, corner in reversed(self._stretches(front)):
             n, rest, ahead = end - begin, front.width - end, self.item * (end - begin)
             for own, held in self.places:
                 here = own + self.item * (front.first + begin)
@@ -264,7 +264,7 @@ class _Few:
                     self.vectors.subtract(True, (rest, n), corner + ahead, size, here + ahead, here, keep=True)
                 self.vectors.solve(True, n, corner, size, here)
 
-    def _parts(self, front: Front) -> list[tuple[int, int, int]]:
+    def _stretches(self, front: Front) -> list[tuple[int, int, int]]:
         """First and last columns that are met together, and where their part of the diagonal begins."""
         at_once = front.width if len(self.x) == 1 else max(CACHE // (self.item * front.size), 1)
         first = self.factor + self.item * front.panel
