@@ -40,6 +40,7 @@ ROUGHNESS_MM = 1.0  # of a surface from place to place
 SHIFT_MM, TURN_DEG = 10.0, 10.0  # standard deviation of each component of the motion, before anything is seen
 CLEARLY = 5.0  # log of the odds by which a motion must explain the images better than none
 LEAST_WEIGHT = 1e-3
+NEGLIGIBLE = 1e-6  # of the largest variance of a smooth motion: moves the result by 1e-4 mm
 MOST_STEPS = 40
 STEP_TOLERANCE_MM = 1e-3
 
@@ -50,8 +51,8 @@ SurfaceMaps = Mapping[int, tuple[DistanceMap, DistanceMap]]  # by a tissue's ind
 class _Shown:
     """Points of one surface of the earlier image, and the later map of its tissue.
 
-    places (n, 3) mm; rest (n,) mm: the earlier map there; own (n, n) mm^2: covariance of the surface's own motion along
-    its normals.
+    places (n, 3) mm; rest (n,) mm: the earlier map there; own (n, r) mm: a factor F of the covariance F F^T of the
+    surface's own motion along its normals.
     """
 
     places: NDArray[np.float64]
@@ -122,7 +123,7 @@ def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
         step = -(-len(first.area) // MOST_POINTS)
         places, normals = first.places[::step], first.normals[::step]
         alike = np.exp(-0.5 * cdist(places, places, "sqeuclidean") / LENGTH_MM**2) * (normals @ normals.T)
-        own = OWN_MOTION_MM[before.tissues[tissue].role] ** 2 * alike
+        own = OWN_MOTION_MM[before.tissues[tissue].role] * _factor(alike)
         surfaces.append(_Shown(places, pair[0].at(places), pair[1], own))
         middles.append((first.area @ first.places / first.area.sum(), second.area @ second.places / second.area.sum()))
     if not surfaces:
@@ -184,10 +185,10 @@ def _descended(surfaces: Sequence[_Shown], centre: NDArray[np.float64], trial: _
     for _ in range(MOST_STEPS):
         noise, prior = _noise(surfaces, trial, trial.seen), _prior(trial.parameters)
         normal, slope = np.diag(prior), prior * trial.parameters
-        for factor, residual, jacobian, seen in zip(noise, trial.residuals, trial.jacobians, trial.seen, strict=True):
-            whitened = linalg.solve_triangular(factor, np.column_stack([jacobian, residual])[seen], lower=True)
-            normal += whitened[:, :6].T @ whitened[:, :6]
-            slope += whitened[:, :6].T @ whitened[:, 6]
+        for each, residual, jacobian, seen in zip(noise, trial.residuals, trial.jacobians, trial.seen, strict=True):
+            product = each.product(np.column_stack([jacobian, residual])[seen])
+            normal += product[:6, :6]
+            slope += product[:6, 6]
         step = -np.linalg.solve(normal, slope)
         for _ in range(6):
             turn = Rotation.from_rotvec(step[:3]) * Rotation.from_rotvec(trial.parameters[:3])
@@ -203,29 +204,51 @@ def _descended(surfaces: Sequence[_Shown], centre: NDArray[np.float64], trial: _
     return trial
 
 
-def _noise(
-    surfaces: Sequence[_Shown], trial: _Trial, seen: Sequence[NDArray[np.bool_]]
-) -> tuple[NDArray[np.float64], ...]:
-    """Cholesky factors of the residuals' covariance among the points that are seen; outliers of the trial have more."""
-    factors, cutoff = [], _cutoff(trial)
+def _factor(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """F (n, r) of F F^T, a smooth covariance (n, n) but for what is too small to tell."""
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > NEGLIGIBLE * values[-1]
+    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+
+
+@dataclass(frozen=True, slots=True)
+class _Noise:
+    """Covariance K = S^2 + F F^T of the residuals of n points, by Woodbury's identity.
+
+    rough (n,) mm: the diagonal of S; smooth (n, r) = S^-1 F; lower (r, r): the Cholesky factor of I + smooth^T smooth.
+    """
+
+    rough: NDArray[np.float64]
+    smooth: NDArray[np.float64]
+    lower: NDArray[np.float64]
+
+    def product(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A^T K^-1 A (m, m) of columns A (n, m)."""
+        scaled = columns / self.rough[:, None]
+        along = linalg.solve_triangular(self.lower, self.smooth.T @ scaled, lower=True)
+        return np.asarray(scaled.T @ scaled - along.T @ along)
+
+
+def _noise(surfaces: Sequence[_Shown], trial: _Trial, seen: Sequence[NDArray[np.bool_]]) -> tuple[_Noise, ...]:
+    """Covariance of each surface's residuals among the points that are seen; outliers of the trial have more."""
+    found, cutoff = [], _cutoff(trial)
     for surface, residual, inside in zip(surfaces, trial.residuals, seen, strict=True):
-        rough = ROUGHNESS_MM**2 / np.maximum(tukey(residual[inside], cutoff), LEAST_WEIGHT)
-        factors.append(linalg.cholesky(surface.own[np.ix_(inside, inside)] + np.diag(rough), lower=True))
-    return tuple(factors)
+        rough = ROUGHNESS_MM / np.sqrt(np.maximum(tukey(residual[inside], cutoff), LEAST_WEIGHT))
+        smooth = surface.own[inside] / rough[:, None]
+        lower = linalg.cholesky(np.eye(smooth.shape[1]) + smooth.T @ smooth, lower=True)
+        found.append(_Noise(rough, smooth, lower))
+    return tuple(found)
 
 
 def _cost(
-    trial: _Trial,
-    noise: Sequence[NDArray[np.float64]],
-    seen: Sequence[NDArray[np.bool_]],
-    prior: NDArray[np.float64],
+    trial: _Trial, noise: Sequence[_Noise], seen: Sequence[NDArray[np.bool_]], prior: NDArray[np.float64]
 ) -> float:
     """Minus log probability of the residuals of the points that are seen, and of the motion, up to a constant."""
-    whitened = [
-        linalg.solve_triangular(factor, residual[inside], lower=True)
-        for factor, residual, inside in zip(noise, trial.residuals, seen, strict=True)
+    misfits = [
+        each.product(residual[inside, None])[0, 0]
+        for each, residual, inside in zip(noise, trial.residuals, seen, strict=True)
     ]
-    return 0.5 * float(sum(each @ each for each in whitened) + prior @ trial.parameters**2)
+    return 0.5 * float(sum(misfits) + prior @ trial.parameters**2)
 
 
 def _prior(parameters: NDArray[np.float64]) -> NDArray[np.float64]:

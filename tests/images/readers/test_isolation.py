@@ -44,8 +44,8 @@ def reading(code: str) -> str:
     """Code that has the process run `code` where it looks the reader of a file up."""
     return (
         "from palpate.images.readers import registry\n"
-        f"plain = registry.format_of\ndef looked_up(path):\n    {code}\n    return plain(path)\n"
-        "registry.format_of = looked_up"
+        f"plain = registry.own_format\ndef looked_up(name):\n    {code}\n    return plain(name)\n"
+        "registry.own_format = looked_up"
     )
 
 

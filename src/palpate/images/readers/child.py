@@ -14,7 +14,7 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.images.label_image import VoxelGrid
-from palpate.images.readers.registry import format_of
+from palpate.images.readers.registry import own_format
 from palpate.images.readers.values import reduced
 
 try:
@@ -28,11 +28,11 @@ else:
 def main(arguments: list[str]) -> None:
     """Read an image.
 
-    Arguments: bytes of address space, seconds of processor time and by the clock, "labels" or "intensities", path, and
-    a grid (JSON).
+    Arguments: bytes of address space, seconds of processor time and by the clock, "labels" or "intensities", the
+    format's name, path, and a grid (JSON).
     """
     memory_bytes, cpu_seconds, wall_seconds = int(arguments[0]), int(arguments[1]), float(arguments[2])
-    kind, path = arguments[3], Path(arguments[4])
+    kind, name, path = arguments[3], arguments[4], Path(arguments[5])
     with os.fdopen(os.dup(1), "wb") as pipe:  # to the parent
         nowhere = os.open(os.devnull, os.O_WRONLY)  # where goes what a C library prints on standard output
         os.dup2(nowhere, 1)
@@ -40,10 +40,10 @@ def main(arguments: list[str]) -> None:
         _limit(memory_bytes, cpu_seconds, wall_seconds)
         try:
             grid = None
-            if len(arguments) > 5:
-                (nx, ny, nz), affine = json.loads(arguments[5])
+            if len(arguments) > 6:
+                (nx, ny, nz), affine = json.loads(arguments[6])
                 grid = VoxelGrid((int(nx), int(ny), int(nz)), np.array(affine, dtype=np.float64))
-            image_format = format_of(path)
+            image_format = own_format(name)
             for module in image_format.needless:
                 sys.modules[module] = cast("ModuleType", None)  # whoever imports it is told that it is not installed
             stored = image_format.stored(path, grid)

@@ -59,7 +59,7 @@ def read_stored(
     module = ["-P", "-W", "ignore", "-m", "palpate.images.readers.child"]
     try:
         process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
-            [sys.executable, *module, *numbers, kind, str(path), *place],
+            [sys.executable, *module, *numbers, kind, image_format.name, str(path), *place],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

@@ -197,4 +197,5 @@ def _write(path: Path, values: NDArray[Any], grid: VoxelGrid, *, intent: str = "
         ) from error
 
 
-register(ImageFormat("NIfTI", (".nii", ".nii.gz"), read_nifti, needless=("pydicom",)))  # half of nibabel's import
+# two thirds of nibabel's import
+register(ImageFormat("NIfTI", (".nii", ".nii.gz"), read_nifti, needless=("pydicom", "scipy")))

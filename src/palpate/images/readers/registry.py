@@ -102,6 +102,11 @@ def format_of(path: Path) -> ImageFormat:
     )
 
 
+def own_format(name: str) -> ImageFormat:
+    """The format of that name which Palpate itself brings."""
+    return next(each for each in _FORMATS.values() if each.name == name)
+
+
 def marked_format(path: Path) -> ImageFormat | None:
     """The format whose mark the file bears, whatever its name; None when there is none, or it cannot be read."""
     try:
