@@ -63,7 +63,7 @@ def test_the_same_anatomy_gives_the_same_mesh_in_whatever_room_mmg_takes(coarse,
 
 
 def test_mmg_without_room_is_a_lack_of_memory_that_says_what_to_do(anatomy, monkeypatch, capfd):
-    monkeypatch.setattr("palpate.mesh.remeshing.SMALL_MB", 16)
+    monkeypatch.setattr("palpate.mesh.remeshing.LEAST_MB", 8)
     with pytest.raises(ResourceError, match=r"make mesh\.edge_length_mm larger"):
         tetrahedralise(anatomy, edge_length_mm=8.0)
     assert capfd.readouterr() == ("", "")

@@ -46,3 +46,10 @@ def test_rigid_motion_keeps_distances():
     points = np.random.default_rng(3).normal(scale=15.0, size=(50, 3))
     moved = points + motion.at(points)
     assert np.linalg.norm(moved - moved[0], axis=1) == pytest.approx(np.linalg.norm(points - points[0], axis=1))
+
+
+def test_a_field_of_waves_is_their_sum_to_a_millionth_however_far_away():
+    field = smooth_field(np.random.default_rng(4), sd_mm=1.0, correlation_mm=10.0, features=300)
+    points = np.random.default_rng(5).normal(scale=300.0, size=(1000, 3))
+    phase = points @ field.frequencies.T
+    assert field.at(points) == pytest.approx(np.cos(phase) @ field.cosines + np.sin(phase) @ field.sines, abs=5e-6)

@@ -20,9 +20,9 @@ from palpate.mesh.cutting import Grid
 from palpate.mesh.tet_mesh import FACES
 
 # Mmg makes room for millions of tetrahedra, and walks through all of it again and again, which takes half a second a
-# mesh. A small one gets less (6 000 tetrahedra need a quarter of it), and comes out the same.
+# mesh. A small one gets less, and comes out the same: 17 000 tetrahedra are content with 40 MB.
 SMALL_TETS = 20_000
-SMALL_MB = 256
+LEAST_MB, MB_A_TET = 64, 0.01
 HOLLOW_REFERENCE = 8  # references 1 to 6 are the faces of the box, 8 any hollow tissue, the rest pairs of regions
 
 
@@ -71,9 +71,10 @@ def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float)
     corners = grid.nodes[grid.tets]
     volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6.0
     wanted = 6.0 * np.sqrt(2.0) * np.sum(volumes / sizes[grid.tets].mean(axis=1) ** 3)  # regular tetrahedra
-    if max(len(grid.tets), wanted) < SMALL_TETS:
-        with suppress(RuntimeError), interrupts_held(), _silent():
-            mesh.remesh(mem=SMALL_MB, verbose=-1)  # an empty mesh, which is refused; the limit stays
+    most = max(len(grid.tets), wanted)
+    if most < SMALL_TETS:
+        with suppress(RuntimeError), interrupts_held(), _silent():  # an empty mesh, which is refused; the limit stays
+            mesh.remesh(mem=int(LEAST_MB + MB_A_TET * most), verbose=-1)
     triangles, references = _surfaces(grid, box)
     # where two faces of the box meet, or one meets a hollow tissue, Mmg must keep the edge sharp
     border = references <= HOLLOW_REFERENCE

@@ -13,7 +13,6 @@ from scipy.spatial import KDTree
 
 NEWTON_STEPS = 40  # for the closest point of an ellipsoid; the iteration is monotone and rarely needs ten
 PLACES = 401  # along a tube, of which one is near every point's closest
-STEP_MM = 1e-4  # of the differences that give a tube's gradient
 
 
 class Shape(Protocol):
@@ -62,16 +61,18 @@ class Ellipsoid:
 
     def _closest(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
         """Closest surface point: q = a^2 p / (t + a^2) with sum (a p / (t + a^2))^2 = 1 (Eberly 2013)."""
-        axes = self.semi_axes
-        away = np.where(local < 0.0, -1.0, 1.0) * np.maximum(np.abs(local), 1e-7 * axes)  # off the symmetry planes
-        t = (axes * np.abs(away) - axes**2).max(axis=1)  # left of the root of a convex, falling function
+        axes = self.semi_axes[:, None]  # the points come last: sums over three axes run along them
+        away = np.where(local.T < 0.0, -1.0, 1.0) * np.maximum(np.abs(local.T), 1e-7 * axes)  # off the symmetry planes
+        stretched, squares = axes * away, axes**2
+        t = (np.abs(stretched) - squares).max(axis=0)  # left of the root of a convex, falling function
         for _ in range(NEWTON_STEPS):
-            ratio = axes * away / (t[:, None] + axes**2)
-            value = (ratio**2).sum(axis=1) - 1.0
-            t = t + value / (2.0 * ratio**2 / (t[:, None] + axes**2)).sum(axis=1)
+            below = t + squares
+            terms = (stretched / below) ** 2
+            value = terms.sum(axis=0) - 1.0
+            t = t + 0.5 * value / (terms / below).sum(axis=0)
             if np.abs(value).max(initial=0.0) < 1e-13:
                 break
-        return np.asarray(axes**2 * away / (t[:, None] + axes**2))
+        return np.asarray((axes * stretched / (t + squares)).T)
 
 
 def ball(centre: NDArray[np.float64], radius: float) -> Ellipsoid:
@@ -110,19 +111,30 @@ class Tube:
         return np.asarray(np.linalg.norm(spoke, axis=1) - self.radius(place))
 
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Gradient (n, 3), mm per mm, by central differences."""
-        steps = STEP_MM * np.eye(3)
-        return np.stack([(self.at(points + s) - self.at(points - s)) / (2.0 * STEP_MM) for s in steps], axis=1)
+        """Gradient (n, 3), mm per mm: (p - c) / |p - c| - r' grad s at the place s of the closest point c."""
+        place, spoke = self.coordinates(points)
+        slope, bend = self._bend(place, spoke)
+        narrowing = np.where((place > 0.0) & (place < 1.0), self.radius(place, 1) / bend, 0.0)  # none at the ends
+        along = np.maximum(np.linalg.norm(spoke, axis=1), 1e-12)
+        return np.asarray(spoke / along[:, None] - narrowing[:, None] * slope)
 
     def coordinates(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Place (n,) of the closest point on the centre line, 0 to 1, and the vector (n, 3) mm from there."""
-        curve, place = self.curve, self.places[self.tree.query(points)[1]]
-        for _ in range(3):  # Newton on (p - c) . c' = 0, whose derivative is close to -|c'|^2
-            slope = curve(place, 1)
-            rest = ((points - curve(place)) * slope).sum(axis=1)
-            bend = (slope**2).sum(axis=1) - ((points - curve(place)) * curve(place, 2)).sum(axis=1)
-            place = np.clip(place + rest / np.maximum(bend, 0.2 * (slope**2).sum(axis=1)), 0.0, 1.0)
-        return np.asarray(place), np.asarray(points - curve(place))
+        place = self.places[self.tree.query(points)[1]]
+        for _ in range(3):  # Newton on (p - c) . c' = 0
+            spoke = points - self.curve(place)
+            slope, bend = self._bend(place, spoke)
+            place = np.clip(place + np.einsum("ni,ni->n", spoke, slope) / bend, 0.0, 1.0)
+        return np.asarray(place), np.asarray(points - self.curve(place))
+
+    def _bend(
+        self, place: NDArray[np.float64], spoke: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """c' (n, 3) mm and |c'|^2 - (p - c) . c'' (n,) mm^2 at places (n,), but no less than a fifth of |c'|^2."""
+        slope = self.curve(place, 1)
+        square = np.einsum("ni,ni->n", slope, slope)
+        bend = square - np.einsum("ni,ni->n", spoke, self.curve(place, 2))
+        return slope, np.asarray(np.maximum(bend, 0.2 * square))
 
     def surface(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (n, 3) mm of the surface, in unit `directions` (n, 3) from places all along the centre line."""
