@@ -10,7 +10,10 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.anatomy import Anatomy, Box, anatomy_of, domain_box, margin_box, volume_preserving
+from palpate.mesh.closing import closed
+from palpate.mesh.snapping import Union
 from palpate.mesh.tetrahedralise import tetrahedralise
+from palpate.phantoms import ball
 
 ORGAN = Tissue("organ", Role.ESTIMATE, (1,))
 DRIVER = Tissue("driver", Role.DRIVER, (2,))
@@ -145,3 +148,15 @@ def test_a_small_ball_keeps_the_volume_of_its_voxels(radius, spacing, smoothing)
 
     assert volume(plain) < 0.97 * voxels
     assert volume(kept) == pytest.approx(voxels, rel=0.01)
+
+
+def test_a_closed_surface_has_the_same_value_with_its_gradient_as_without(rng):
+    """Of two balls with a thin gap, and of both as one."""
+    first, second = ball(np.array([-10.5, 0.0, 0.0]), 10.0), ball(np.array([10.5, 0.0, 0.0]), 10.0)
+    tissues = (Tissue("a", Role.DRIVER, (1,)), Tissue("b", Role.DRIVER, (2,)), Tissue("rest", Role.KNOWN))
+    anatomy = Anatomy(tissues, (first, second, None), Box(np.full(3, -30.0), np.eye(3), np.full(3, 60.0)))
+    shut = closed(anatomy, gap_mm=3.0).level_sets[1]
+    points = rng.normal(scale=4.0, size=(400, 3))
+    assert np.any(np.abs(shut.at(points) - second.at(points)) > 0.5)  # the gap is shut
+    for phi in (shut, Union((first, shut))):
+        assert phi.values_and_gradients(points)[0] == pytest.approx(phi.at(points), abs=1e-12)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,22 @@ class LevelSet(Protocol):
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Gradient (n, 3), mm per mm, at points (n, 3) in RAS mm."""
         ...
+
+
+@runtime_checkable
+class OneLookUp(Protocol):
+    """A level set that tells its value and its gradient together for little more than one of them."""
+
+    def values_and_gradients(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Values (n,) mm and gradients (n, 3), mm per mm, at points (n, 3) in RAS mm."""
+        ...
+
+
+def values_and_gradients(phi: LevelSet, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Values (n,) mm and gradients (n, 3), mm per mm, at points (n, 3) in RAS mm."""
+    if isinstance(phi, OneLookUp):
+        return phi.values_and_gradients(points)
+    return phi.at(points), phi.gradient_at(points)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.mesh.anatomy import Anatomy, Box, LevelSet
+from palpate.mesh.anatomy import Anatomy, Box, LevelSet, values_and_gradients
 
 STEEPNESS = 3.0  # how much faster than the gap a closed surface approaches: makes it cross the other, not graze it
 PARALLEL, CROSSING = np.cos(np.radians([20.0, 45.0]))  # surfaces at less than 20 degrees are closed, over 45 are not
@@ -65,24 +65,37 @@ class _Closed:
 
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Gradient (n, 3), dimensionless, of the changed level set at points (n, 3) mm."""
-        gradient = self.phi.gradient_at(points)
-        values = self.phi.at(points)
+        return self.values_and_gradients(points)[1]
+
+    def values_and_gradients(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The changed level set (n,) mm and its gradient (n, 3), dimensionless, at points (n, 3) mm."""
+        values, gradient = values_and_gradients(self.phi, points)
         near = np.flatnonzero(np.abs(values) < self.gap_mm)
-        change = np.zeros_like(gradient)
+        shift, change = np.zeros_like(values), np.zeros_like(gradient)
         for winner in self.winners if len(near) else ():
-            change[near] += self._change(winner, points[near], values[near])[1]
-        return np.asarray(gradient + STEEPNESS * change)
+            by_value, by_gradient = self._change(winner, points[near], values[near], gradient[near])
+            shift[near] += by_value
+            change[near] += by_gradient
+        return np.asarray(values + STEEPNESS * shift), np.asarray(gradient + STEEPNESS * change)
 
     def _change(
-        self, winner: LevelSet, points: NDArray[np.float64], values: NDArray[np.float64]
+        self,
+        winner: LevelSet,
+        points: NDArray[np.float64],
+        values: NDArray[np.float64],
+        gradient: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Change of the level set (n,) and of its gradient (n, 3), per steepness, next to one winner."""
+        """Change of the level set (n,) and of its gradient (n, 3), per steepness, next to one winner.
+
+        values (n,) mm and, where it is known, gradient (n, 3): of the level set itself at points (n, 3) mm.
+        """
         change, slope = np.zeros(len(points)), np.zeros((len(points), 3))
         distance = winner.at(points)
         here = np.flatnonzero(np.abs(distance) < self.gap_mm)
         if not len(here):
             return change, slope
-        own, other = self.phi.gradient_at(points[here]), winner.gradient_at(points[here])
+        own = self.phi.gradient_at(points[here]) if gradient is None else gradient[here]
+        other = winner.gradient_at(points[here])
         lengths = np.linalg.norm(own, axis=1) * np.linalg.norm(other, axis=1)
         cosine = np.einsum("ni,ni->n", own, other) / np.maximum(lengths, 1e-12)
         weight = np.sign(cosine) * np.clip((np.abs(cosine) - CROSSING) / (PARALLEL - CROSSING), 0.0, 1.0)

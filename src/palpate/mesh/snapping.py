@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.mesh.anatomy import Anatomy, Box, LevelSet
+from palpate.mesh.anatomy import Anatomy, Box, LevelSet, values_and_gradients
 from palpate.mesh.cutting import Grid, signed_volumes, within_faces
 from palpate.mesh.tet_mesh import FACES
 
@@ -32,12 +32,18 @@ class Union:
 
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Gradient (n, 3), mm per mm, of the lowest part at points (n, 3) in RAS mm."""
-        lowest = np.argmin([part.at(points) for part in self.parts], axis=0)
-        gradient = np.zeros((len(points), 3))
+        return self.values_and_gradients(points)[1]
+
+    def values_and_gradients(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Values (n,) mm and the lowest part's gradients (n, 3), mm per mm, at points (n, 3) in RAS mm."""
+        if len(self.parts) == 1:
+            return values_and_gradients(self.parts[0], points)
+        values = np.array([part.at(points) for part in self.parts])
+        lowest, gradient = values.argmin(axis=0), np.zeros((len(points), 3))
         for i, part in enumerate(self.parts):
             mine = lowest == i
             gradient[mine] = part.gradient_at(points[mine])
-        return gradient
+        return values.min(axis=0), gradient
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,28 +66,29 @@ class Contacts:
         """The same box, but nodes are free to leave the surfaces."""
         return replace(self, on=np.zeros_like(self.on))
 
-    def values(self, points: NDArray[np.float64], nodes: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Level set less target (n, n_surfaces) mm at `points` (n, 3) mm of the `nodes` (n,); zero where not on it."""
-        result = np.zeros((len(nodes), len(self.level_sets)))
-        for k, phi in enumerate(self.level_sets):
-            rows = np.flatnonzero(self.on[nodes, k])
-            if len(rows):
-                result[rows, k] = phi.at(points[rows]) - self.target[nodes[rows], k]
-        return result
+    def _values_and_gradients(
+        self, points: NDArray[np.float64], nodes: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Level sets less targets (n, n_surfaces) mm at `points` (n, 3) mm of the `nodes` (n,), and their gradients.
 
-    def gradients(self, points: NDArray[np.float64], nodes: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Gradients (n, n_surfaces, 3) along the box's faces where a node lies on one; zero for other surfaces."""
-        result = np.zeros((len(nodes), len(self.level_sets), 3))
+        These (n, n_surfaces, 3) are along the box's faces where a node lies on one. All zero where it is not on it.
+        """
+        values, gradients = (
+            np.zeros((len(nodes), len(self.level_sets))),
+            np.zeros((len(nodes), len(self.level_sets), 3)),
+        )
         for k, phi in enumerate(self.level_sets):
             rows = np.flatnonzero(self.on[nodes, k])
             if len(rows):
-                result[rows, k] = within_faces(phi.gradient_at(points[rows]), points[rows], self.box)
-        return result
+                value, gradient = values_and_gradients(phi, points[rows])
+                values[rows, k] = value - self.target[nodes[rows], k]
+                gradients[rows, k] = within_faces(gradient, points[rows], self.box)
+        return values, gradients
 
     def onto(self, points: NDArray[np.float64], nodes: NDArray[np.int64], *, limit_mm: float) -> NDArray[np.float64]:
         """One Newton step (n, 3) mm, of least length, that brings `points` of the `nodes` onto their surfaces."""
-        inverse = np.linalg.pinv(self.gradients(points, nodes), rcond=GRAZING)
-        step = -np.einsum("nik,nk->ni", inverse, self.values(points, nodes))
+        values, gradients = self._values_and_gradients(points, nodes)
+        step = -np.einsum("nik,nk->ni", np.linalg.pinv(gradients, rcond=GRAZING), values)
         length = np.linalg.norm(step, axis=1, keepdims=True)
         return np.asarray(step * np.minimum(1.0, limit_mm / np.maximum(length, 1e-12)))
 

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from palpate.mesh.anatomy import values_and_gradients
 from palpate.mesh.surface import mean_curvature, triangle_normals, vertex_normals
 from palpate.observation.contract import Residuals
 from palpate.observation.observed_surface import ObservedSurface
-from palpate.observation.target import SurfaceTarget, places_within, values_and_gradients
+from palpate.observation.target import SurfaceTarget, places_within
 
 T = TypeVar("T", bound=np.generic)
 ON_EDGE = 1e-9

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.images.distance import DistanceMap, IsosurfacePoints, isosurface_points, terrace_noise
-from palpate.mesh.anatomy import LevelSet
+from palpate.mesh.anatomy import LevelSet, values_and_gradients
 from palpate.mesh.surface import triangle_normals
 from palpate.observation.observed_surface import FieldOfView, ObservedSurface
 
@@ -86,24 +85,6 @@ def surface_target(
         voxels=(before, after),
         view=view,
     )
-
-
-@runtime_checkable
-class OneLookUp(Protocol):
-    """A distance that tells its value and its gradient together for little more than one of them."""
-
-    def values_and_gradients(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Signed distances (n,) mm and gradients (n, 3), mm per mm, at points (n, 3) in RAS mm."""
-        ...
-
-
-def values_and_gradients(
-    distance: LevelSet, points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Signed distances (n,) mm and gradients (n, 3), mm per mm, at points (n, 3) in RAS mm."""
-    if isinstance(distance, OneLookUp):
-        return distance.values_and_gradients(points)
-    return distance.at(points), distance.gradient_at(points)
 
 
 def places_within(corners: NDArray[np.float64], barycentric: NDArray[np.float64]) -> NDArray[np.float64]:

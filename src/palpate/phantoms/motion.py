@@ -177,7 +177,7 @@ class SmoothField:
     sines: NDArray[np.float64]
 
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Field (n, 3) mm at points (n, 3) mm, to a millionth of itself: phases in double, waves in single precision."""
+        """Field (n, 3) mm at points (n, 3) mm, to a millionth: phases in double, waves in single precision."""
         turns, block = self.frequencies.T / (2.0 * np.pi), max(1, BLOCK // len(self.frequencies))
         cosines, sines = self.cosines.astype(np.float32), self.sines.astype(np.float32)
         found = np.empty((len(points), 3))

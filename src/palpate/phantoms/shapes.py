@@ -45,15 +45,20 @@ class Ellipsoid:
 
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Exact Euclidean signed distance (n,) mm."""
-        local = (points - self.centre) @ self.rotation
-        distance = np.linalg.norm(local - self._closest(local), axis=1)
-        outside = ((local / self.semi_axes) ** 2).sum(axis=1) > 1.0
-        return np.asarray(np.where(outside, distance, -distance))
+        return self.values_and_gradients(points)[0]
 
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Outward normal (n, 3), dimensionless, at the closest point of the surface."""
-        normal = self._closest((points - self.centre) @ self.rotation) / self.semi_axes**2
-        return np.asarray(normal @ self.rotation.T / np.linalg.norm(normal, axis=1, keepdims=True))
+        return self.values_and_gradients(points)[1]
+
+    def values_and_gradients(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Signed distance (n,) mm and outward normal (n, 3) at the closest point of the surface."""
+        local = (points - self.centre) @ self.rotation
+        closest = self._closest(local)
+        distance, normal = np.linalg.norm(local - closest, axis=1), closest / self.semi_axes**2
+        outside = ((local / self.semi_axes) ** 2).sum(axis=1) > 1.0
+        normal = normal @ self.rotation.T / np.linalg.norm(normal, axis=1, keepdims=True)
+        return np.asarray(np.where(outside, distance, -distance)), np.asarray(normal)
 
     def surface(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (n, 3) mm of the surface that belong to unit `directions` (n, 3)."""
@@ -112,11 +117,16 @@ class Tube:
 
     def gradient_at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Gradient (n, 3), mm per mm: (p - c) / |p - c| - r' grad s at the place s of the closest point c."""
+        return self.values_and_gradients(points)[1]
+
+    def values_and_gradients(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Signed distance (n,) mm and its gradient (n, 3), mm per mm."""
         place, spoke = self.coordinates(points)
         slope, bend = self._bend(place, spoke)
         narrowing = np.where((place > 0.0) & (place < 1.0), self.radius(place, 1) / bend, 0.0)  # none at the ends
-        along = np.maximum(np.linalg.norm(spoke, axis=1), 1e-12)
-        return np.asarray(spoke / along[:, None] - narrowing[:, None] * slope)
+        length = np.linalg.norm(spoke, axis=1)
+        gradient = spoke / np.maximum(length, 1e-12)[:, None] - narrowing[:, None] * slope
+        return np.asarray(length - self.radius(place)), np.asarray(gradient)
 
     def coordinates(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Place (n,) of the closest point on the centre line, 0 to 1, and the vector (n, 3) mm from there."""
@@ -130,7 +140,7 @@ class Tube:
     def _bend(
         self, place: NDArray[np.float64], spoke: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """c' (n, 3) mm and |c'|^2 - (p - c) . c'' (n,) mm^2 at places (n,), but no less than a fifth of |c'|^2."""
+        """C' (n, 3) mm and |c'|^2 - (p - c) . c'' (n,) mm^2 at places (n,), but no less than a fifth of |c'|^2."""
         slope = self.curve(place, 1)
         square = np.einsum("ni,ni->n", slope, slope)
         bend = square - np.einsum("ni,ni->n", spoke, self.curve(place, 2))
@@ -141,7 +151,8 @@ class Tube:
         place = np.linspace(0.0, 1.0, len(directions))
         points = self.curve(place) + self.radius(place)[:, None] * directions
         for _ in range(2):
-            points = points - self.at(points)[:, None] * self.gradient_at(points)
+            distance, gradient = self.values_and_gradients(points)
+            points = points - distance[:, None] * gradient
         return np.asarray(points)
 
 
