@@ -153,8 +153,7 @@ def test_a_small_ball_keeps_the_volume_of_its_voxels(radius, spacing, smoothing)
 def test_a_closed_surface_has_the_same_value_with_its_gradient_as_without():
     """Of two balls with a thin gap, and of both as one."""
     first, second = ball(np.array([-10.5, 0.0, 0.0]), 10.0), ball(np.array([10.5, 0.0, 0.0]), 10.0)
-    tissues = (Tissue("a", Role.DRIVER, (1,)), Tissue("b", Role.DRIVER, (2,)), Tissue("rest", Role.KNOWN))
-    anatomy = Anatomy(tissues, (first, second, None), Box(np.full(3, -30.0), np.eye(3), np.full(3, 60.0)))
+    anatomy = Anatomy((DRIVER, ORGAN, REST), (first, second, None), Box(np.full(3, -30.0), np.eye(3), np.full(3, 60.0)))
     shut = closed(anatomy, gap_mm=3.0).level_sets[1]
     points = np.random.default_rng(0).normal(scale=4.0, size=(400, 3))
     assert np.any(np.abs(shut.at(points) - second.at(points)) > 0.5)  # the gap is shut
