@@ -10,7 +10,7 @@ import nibabel
 import numpy as np
 import pytest
 
-from palpate import memory
+from palpate import processes as memory
 from palpate.errors import ResourceError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation

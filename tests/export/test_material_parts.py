@@ -14,7 +14,7 @@ from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.material import material_modes
-from palpate.mesh.constraint import Constraint
+from palpate.mesh.space import Constraint
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from palpate.errors import InputDataError
-from palpate.images.distance import distance_map
+from palpate.images.distance import REACH_MM, cropped, distance_map, tissue_distance_map, window_around
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_distance import REACH_MM, cropped, tissue_distance_map, window_around
 
 TISSUES = (
     Tissue("organ", Role.ESTIMATE, (1,)),

@@ -20,7 +20,7 @@ from palpate.approximation import (
     reduced_basis,
 )
 from palpate.approximation.expansion import Expansion, coarse_equilibrium, expansion_around
-from palpate.mechanics.conditions import Conditions
+from palpate.mechanics.boundary import Conditions
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
 from palpate.mechanics.forward import SolveCounts

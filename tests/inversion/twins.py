@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 
 from palpate.approximation import reduced_basis
+from palpate.images.distance import tissue_distance_map
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_distance import tissue_distance_map
 from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, Objective, with_first_noise
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import LinearModel, linear_model

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigurationError, NotConverged
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.conditions import Conditions
+from palpate.mechanics.boundary import Conditions, outer_constraint
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.registry import LAWS

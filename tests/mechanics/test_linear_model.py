@@ -9,8 +9,7 @@ import pytest
 from scipy import sparse
 
 from palpate.errors import ConfigurationError
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.conditions import Conditions
+from palpate.mechanics.boundary import Conditions, outer_constraint
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.space import lagrange_space

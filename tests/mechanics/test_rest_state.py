@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from palpate.mechanics.conditions import Conditions
+from palpate.mechanics.boundary import Conditions
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.equilibrium import equilibrium
 from palpate.mechanics.finite_strain import finite_strain_model
@@ -17,8 +17,7 @@ from palpate.mechanics.loads import DeadLoad, gravity
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mechanics.reaction import surface_reaction
 from palpate.mechanics.rest_state import unloaded_displacement
-from palpate.mesh.constraint import Constraint
-from palpate.mesh.space import lagrange_space
+from palpate.mesh.space import Constraint, lagrange_space
 
 NEO_HOOKEAN, MODULUS, LENGTH = LAWS["neo-hookean"], np.array([200.0]), 60.0
 NONE = np.zeros(0)

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from palpate.report.collect import collect
-from palpate.report.methods import methods_text
-from palpate.report.sources import SOURCES, bibtex, reference_line
+from palpate.report.methods import SOURCES, bibtex, methods_text, reference_line
 from palpate.study.case import CaseLoad, Mechanics, MeshBody
 from palpate.study.case_data import CaseData
 

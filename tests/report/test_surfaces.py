@@ -7,11 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from palpate.images.distance import observation_width
+from palpate.images.distance import observation_width, tissue_distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_distance import tissue_distance_map
 from palpate.report.pairs import bone_distances
 from palpate.report.surfaces import carried_outline, image_surface, model_surface
 

@@ -13,10 +13,9 @@ from palpate.cli import main
 from palpate.demo import DATA
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_image import LabelImage, VoxelGrid
-from palpate.images.label_table import read_label_table
+from palpate.images.label_table import CLASSES, read_label_table
 from palpate.images.readers import read_label_image, write_label_image
 from palpate.images.tissue import Role
-from palpate.images.totalsegmentator import CLASSES
 from palpate.study import check
 from palpate.study.case_file import read_case
 from palpate.study.cost import expected_cost

@@ -13,7 +13,7 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
 from palpate.uncertainty import FittedState
 from palpate.uncertainty.intervals import NORMAL_95
-from palpate.uncertainty.joint_region import LEVEL
+from palpate.uncertainty.profile import LEVEL
 from palpate.unknowns import layer_blocks
 
 NOISE = NoiseModel(np.array([0.1**2]), np.array([3.0]))

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.inversion import Bounds, fixed_correspondence, gauss_newton
-from palpate.uncertainty.joint_region import DIRECTIONS, LEVEL, joint_region
-from palpate.uncertainty.profile import profile
+from palpate.uncertainty.profile import DIRECTIONS, LEVEL, joint_region, profile
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
 

@@ -17,7 +17,7 @@ from palpate.mechanics.first_order import FirstOrderModel, expanded
 from palpate.mechanics.forward import ForwardModel, Outputs, SolveCounts
 from palpate.mechanics.linear_model import LinearEquilibrium, LinearModel
 from palpate.mechanics.solvers.contract import Factorisation
-from palpate.mesh.constraint import Constraint
+from palpate.mesh.space import Constraint
 
 
 @contextmanager

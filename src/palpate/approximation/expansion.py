@@ -20,7 +20,7 @@ from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrai
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.solvers.contract import Factorisation
-from palpate.mesh.constraint import Constraint
+from palpate.mesh.space import Constraint
 from palpate.progress import Progress, silent
 
 REACH = 0.8  # of ln E, within which it is trusted

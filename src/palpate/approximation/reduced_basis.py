@@ -15,7 +15,7 @@ from palpate.mechanics.reduced import Projection, ReducedModel, projection
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import SOLVERS, CheckedFactorisation
-from palpate.mesh.constraint import Constraint
+from palpate.mesh.space import Constraint
 
 SERIES = 40  # vectors at the most
 FAR = 30.0  # spread of the moduli's ratios to the factorised ones, beyond which a new factorisation costs less

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.cohort.task import Outcome, Task
-from palpate.memory import peak_memory_gb
+from palpate.processes import peak_memory_gb
 from palpate.study.lock import own_file
 
 try:

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-from palpate.children import environment_of_child, name_of_end
 from palpate.cohort.task import Outcome, Task
 from palpate.errors import ResourceError
+from palpate.processes import environment_of_child, name_of_end
 
 ESTIMATE = "palpate.cohort.work:estimate_row"
 LOOK_S = 0.1  # how often memory is looked at

@@ -13,7 +13,7 @@ from palpate.cohort.resolve import case_of, row_key
 from palpate.cohort.task import Outcome, Task, failure_class_of
 from palpate.errors import EstimationError, InputDataError, PalpateError
 from palpate.images.named_labels import printable
-from palpate.memory import peak_memory_gb
+from palpate.processes import peak_memory_gb
 from palpate.steps.saving import save_estimate, save_failure
 from palpate.study import run
 from palpate.study.cost import ExpectedCost

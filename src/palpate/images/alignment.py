@@ -13,11 +13,16 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from palpate.errors import InputDataError
-from palpate.images.distance import DistanceMap, IsosurfacePoints, isosurface_points, smoothing_width
+from palpate.images.distance import (
+    DistanceMap,
+    IsosurfacePoints,
+    isosurface_points,
+    smoothing_width,
+    tissue_distance_map,
+)
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.images.tissue_distance import tissue_distance_map
 from palpate.parallel import mapped
 
 BORDER_VOXELS = 3.0  # nearer to the image's border the map continues what it cannot see

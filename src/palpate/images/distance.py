@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, special
 
+from palpate.errors import InputDataError
 from palpate.images.label_image import VoxelGrid
+from palpate.images.segmentation import Segmentation
 
 PROBIT_LIMIT = 2.5  # beyond so many sigma the smoothed indicator has lost the distance to rounding
 TRUNCATED = 5.0  # sigma, beyond which the Gaussian is none
 COHERENCE = 1.7  # variance times correlation area of the rounding on a patch along a grid plane, in voxel edges^4
 BORDER = 1.0  # voxels: nearer to the image's border the map is a continuation, not a measurement
+REACH_MM = 25.0  # organs that move further are not found again
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,3 +212,34 @@ def isosurface_points(distance: DistanceMap, level: float = 0.0) -> IsosurfacePo
     normals = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
     face = distance.grid.voxel_volume / distance.grid.spacing[axis[kept]]
     return IsosurfacePoints(places, normals, face * np.abs(np.einsum("na,na->n", normals, directions)))
+
+
+def tissue_distance_map(
+    segmentation: Segmentation, tissue: int, *, smoothing_mm: float, reach_mm: float = REACH_MM, far: bool = True
+) -> DistanceMap:
+    """Signed distance map of a tissue by its index; it reaches `reach_mm` beyond the tissue's bounding box.
+
+    `smoothing_mm`, `far`: see `distance_map`. Raises `InputDataError` when the image has no voxel of the tissue.
+    """
+    mask = segmentation.mask(tissue)
+    if not mask.any():
+        raise InputDataError(f"tissue '{segmentation.tissues[tissue].name}' has no voxel in the image")
+    window = window_around(mask, segmentation.grid, reach_mm=reach_mm)
+    return distance_map(mask[window], cropped(segmentation.grid, window), smoothing_mm=smoothing_mm, far=far)
+
+
+def window_of(index: NDArray[np.float64], grid: VoxelGrid, *, margin: int) -> tuple[slice, slice, slice]:
+    """Index ranges of the voxels within `margin` of voxel indices (n, 3); one voxel where these lie beyond the grid."""
+    last = np.array(grid.shape) - 1
+    low = np.clip(np.floor(index.min(axis=0)).astype(np.int64) - margin, 0, last)
+    high = np.clip(np.ceil(index.max(axis=0)).astype(np.int64) + margin, 0, last)
+    i, j, k = (slice(int(a), int(b) + 1) for a, b in zip(low, high, strict=True))
+    return (i, j, k)
+
+
+def cropped(grid: VoxelGrid, window: tuple[slice, slice, slice]) -> VoxelGrid:
+    """The grid of the voxels in `window`, at the same places in the world."""
+    affine = np.array(grid.affine)
+    affine[:3, 3] = grid.world(np.array([[s.start for s in window]], dtype=float))[0]
+    i, j, k = (s.stop - s.start for s in window)
+    return VoxelGrid((i, j, k), affine)

@@ -11,9 +11,10 @@ import csv
 import io
 import json
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,15 @@ from palpate.images.named_labels import (
     hex_colour,
 )
 
+# The classes of TotalSegmentator's tasks `total` (version 2, CT) and `total_mr`: facts, from its table `class_map`
+# (https://github.com/wasserth/TotalSegmentator, totalsegmentator/map_to_binary.py). A class's number is its place in
+# the list, from 1. No class of either task is the rectum.
+CLASSES: Mapping[str, Mapping[str, int]] = {
+    task: {name: number for number, name in enumerate(names, start=1)}
+    for task, names in json.loads(
+        (resources.files("palpate.images") / "totalsegmentator.json").read_text("utf-8")
+    ).items()
+}
 MAX_BYTES = 2**20
 COLOUR = re.compile(r"#[0-9a-f]{6}")
 COLUMNS = ("LabelValue", "Name", "Color_R", "Color_G", "Color_B", "Color_A")

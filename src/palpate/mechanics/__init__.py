@@ -1,7 +1,7 @@
 """Elastic equilibrium: stiffness, boundary conditions, linear solvers, forward models and their derivatives."""
 
+from palpate.mechanics.boundary import Conditions as Conditions
 from palpate.mechanics.boundary import outer_constraint as outer_constraint
-from palpate.mechanics.conditions import Conditions as Conditions
 from palpate.mechanics.dilatation import ELEMENTS as ELEMENTS
 from palpate.mechanics.dilatation import Dilatation as Dilatation
 from palpate.mechanics.dilatation import ElementChoice as ElementChoice

@@ -13,8 +13,7 @@ from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.loads import Load
 from palpate.mechanics.newton import NewtonSettings
 from palpate.mechanics.solvers.contract import Factorisation
-from palpate.mesh.constraint import Constraint
-from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.space import Constraint, LagrangeSpace
 
 ACCURACY = 1e-7  # of the forces: the displacement's error is some nanometres
 

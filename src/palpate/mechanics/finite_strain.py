@@ -16,7 +16,7 @@ from scipy import sparse
 
 from palpate.errors import ConfigurationError, NotConverged
 from palpate.mechanics.balance import TissueBalance
-from palpate.mechanics.conditions import Conditions
+from palpate.mechanics.boundary import Conditions
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.forward import SolveCounts, checked_coefficients, checked_moduli
 from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
@@ -29,8 +29,7 @@ from palpate.mechanics.pattern import BlockPattern, Restriction, Stiffness, bloc
 from palpate.mechanics.solvers.conjugate_gradients import times
 from palpate.mechanics.solvers.contract import AT_ONCE, Factorisation
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
-from palpate.mesh.constraint import Constraint
-from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.space import Constraint, LagrangeSpace
 
 Array = NDArray[np.float64]
 

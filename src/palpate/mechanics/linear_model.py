@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate.mechanics.conditions import Conditions
+from palpate.mechanics.boundary import Conditions
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.forward import DenseEquilibrium, SolveCounts, checked_coefficients, checked_moduli
 from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
@@ -31,8 +31,7 @@ from palpate.mechanics.stiffness import (
     stiffness_parts,
     tissue_stiffness,
 )
-from palpate.mesh.constraint import Constraint
-from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.space import Constraint, LagrangeSpace
 from palpate.parallel import mapped
 
 LINEAR = Linear()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.mechanics.solvers.conjugate_gradients import times
-from palpate.mesh.constraint import Constraint
+from palpate.mesh.space import Constraint
 
 Stiffness: TypeAlias = "sparse.bsr_matrix[np.float64] | sparse.csr_matrix[np.float64]"  # in blocks of points, or not
 

@@ -13,8 +13,7 @@ from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.material import HOMOGENEOUS, MaterialModes
-from palpate.mesh.constraint import Constraint
-from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.space import Constraint, LagrangeSpace
 
 NEWTON = 1e-3  # of a mN
 

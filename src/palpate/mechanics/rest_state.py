@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
-from palpate.mechanics.conditions import Conditions
+from palpate.mechanics.boundary import Conditions
 from palpate.mechanics.equilibrium import from_start
 from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.loads import DeadLoad, Load
-from palpate.mesh.constraint import Constraint
+from palpate.mesh.space import Constraint
 
 TOLERANCE = 1e-8  # of the body's size, by which the loaded body may miss what was seen
 FORCES = 1e-10  # of the forces: to which each equilibrium is found on the way

@@ -9,8 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from palpate.errors import GeometryError
 from palpate.mechanics.solvers.contract import Coarser
-from palpate.mesh.constraint import Constraint
-from palpate.mesh.space import LagrangeSpace
+from palpate.mesh.space import Constraint, LagrangeSpace
 
 AXES = ("x (right)", "y (anterior)", "z (superior)")
 NAMES = tuple(f"translation along {axis}" for axis in AXES) + tuple(f"rotation about {axis}" for axis in AXES)

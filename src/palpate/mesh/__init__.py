@@ -6,10 +6,10 @@ from palpate.mesh.anatomy import LevelSet as LevelSet
 from palpate.mesh.anatomy import anatomy_of as anatomy_of
 from palpate.mesh.anatomy import domain_box as domain_box
 from palpate.mesh.anatomy import margin_box as margin_box
-from palpate.mesh.constraint import Constraint as Constraint
 from palpate.mesh.locate import located as located
 from palpate.mesh.locate import point_interpolation as point_interpolation
 from palpate.mesh.quality import check_mesh as check_mesh
+from palpate.mesh.space import Constraint as Constraint
 from palpate.mesh.space import LagrangeSpace as LagrangeSpace
 from palpate.mesh.space import lagrange_space as lagrange_space
 from palpate.mesh.space import shape_functions as shape_functions

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
 from palpate.errors import GeometryError, InputDataError
-from palpate.images.distance import DistanceMap, distance_map, window_around
+from palpate.images.distance import DistanceMap, cropped, distance_map, window_around
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_distance import cropped
 from palpate.parallel import mapped
 
 ON_FACE_MM = 1e-4  # rounding in the coordinates of nodes on the faces of a box

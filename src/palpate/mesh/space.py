@@ -1,4 +1,4 @@
-"""Lagrange nodes of order 1 or 2 on a mesh: the points where a displacement has its values."""
+"""Lagrange nodes of order 1 or 2 on a mesh: the points where a displacement has its values, and which are free."""
 
 from __future__ import annotations
 
@@ -74,3 +74,22 @@ def shape_functions(order: int, barycentric: NDArray[np.float64]) -> NDArray[np.
     first, second = (TET_EDGES if barycentric.shape[1] == 4 else TRIANGLE_EDGES).T
     corners = barycentric * (2.0 * barycentric - 1.0)
     return np.concatenate([corners, 4.0 * barycentric[:, first] * barycentric[:, second]], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Constraint:
+    """Admissible displacements u = free z + modes q + offset of a Lagrange space with n_dof = 3 n_points unknowns.
+
+    The unknown of point p along axis a has the number 3 p + a. free (n_dof, n_free) sparse with orthonormal columns,
+    dimensionless; modes (n_dof, n_modes) mm per unit of q; offset (n_dof,) mm. Rows of `modes` and `offset` are zero
+    where `free` is not (but for a sliding node, which is given along its normal only).
+    """
+
+    free: sparse.csr_matrix[np.float64]
+    modes: NDArray[np.float64]
+    offset: NDArray[np.float64]
+
+    @property
+    def n_modes(self) -> int:
+        """Number of unknown modes."""
+        return int(self.modes.shape[1])

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from palpate.errors import EstimationError
 from palpate.images.checks import later_names
-from palpate.images.distance import DistanceMap
+from palpate.images.distance import DistanceMap, tissue_distance_map
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue_distance import tissue_distance_map
 from palpate.mesh.surface import vertex_normals
 from palpate.observation.contract import Fit, ImagedBody, Observation, Residuals, Weighting
 from palpate.observation.noise_model import (

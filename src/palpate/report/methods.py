@@ -1,16 +1,17 @@
-"""The methods section that a paper about the result would need, with its sources."""
+"""The methods section that a paper about the result would need, with the works it cites (assets/sources.bib)."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from importlib import resources
 from typing import Any
 
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.report.report_data import MAP_OF, MESH, VARIATION, ReportData
 from palpate.report.rows import CAUSES, listed, moduli_in, ratio_rows
-from palpate.report.sources import SOURCES, bibtex, reference_line
 from palpate.unknowns import KNOWN_MODULUS
 
 ELEMENTS = {
@@ -148,3 +149,47 @@ def _law(data: ReportData) -> Law | None:
     settings = dict(data.settings)
     stated = {name: float(settings[name]) for name in law_parameters() if name in settings}
     return law_from(data.document["law"], stated) if data.document["law"] in LAWS else None
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A cited work: BibTeX's kind of entry, and its fields as they stand there."""
+
+    kind: str
+    fields: Mapping[str, str]
+
+    @property
+    def title(self) -> str:
+        """Its title, without the braces that keep capitals."""
+        return self.fields["title"].strip("{}")
+
+
+FILE = (resources.files("palpate.report") / "assets" / "sources.bib").read_text(encoding="utf-8")
+SOURCES = {
+    key: Source(kind, dict(re.findall(r"^  (\w+) = \{(.*)\},?$", fields, re.MULTILINE)))
+    for kind, key, fields in re.findall(r"^@(\w+)\{(\w+),$(.*?)^\}$", FILE, re.MULTILINE | re.DOTALL)
+}
+
+
+def reference_line(source: Source) -> str:
+    """The source as a line of a list of references: "Family AB", or a body's name, of each author; title, and where."""
+    fields, names = source.fields, list[str]()
+    for author in fields["author"].split(" and "):
+        family, _, given = author.strip("{}").partition(", ")
+        names.append(f"{family} {''.join(part[0] for part in given.split())}".strip())
+    title = f"{source.title}, {fields['edition']} ed." if "edition" in fields else f"{source.title}."
+    rest = ""
+    if source.kind == "article":
+        pages = fields["pages"].replace("--", "-")
+        rest = f" {fields['journal']} {fields['volume']} ({fields['year']}) {pages}."
+    elif source.kind == "book":
+        rest = f" {fields['publisher']}, {fields['year']}."
+    elif "version" in fields:
+        rest = f" Version {fields['version']}, {fields['url']}"
+    return f"{', '.join(names)}. {title}{rest}"
+
+
+def bibtex(key: str, source: Source) -> str:
+    """The source as an entry of a BibTeX file under `key`."""
+    lines = [f"  {name} = {{{value}}}" for name, value in source.fields.items()]
+    return f"@{source.kind}{{{key},\n" + ",\n".join(lines) + "\n}"

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from palpate.images.distance import window_of
 from palpate.images.label_image import VoxelGrid
-from palpate.images.tissue_distance import window_of
 
 PIXEL_MM = 0.8
 

@@ -8,9 +8,8 @@ import igl
 import numpy as np
 from scipy import ndimage
 
-from palpate.images.distance import observation_width, window_around
+from palpate.images.distance import cropped, observation_width, tissue_distance_map, window_around
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue_distance import cropped, tissue_distance_map
 from palpate.mesh.surface import tissue_surface, triangle_normals
 from palpate.observation.observed_surface import observed_surface
 from palpate.report.report_data import ModelSurface, TriangleSurface

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.images.body_in_ct import shows_air
+from palpate.images.distance import cropped, window_of
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_intensities
 from palpate.images.registration import Registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.images.tissue_distance import cropped, window_of
 from palpate.report.report_data import GREY_STEPS, SliceBox, Volume
 from palpate.study.result import CaseResult
 

@@ -14,8 +14,7 @@ from palpate.findings import Finding
 from palpate.images.distance import observation_width
 from palpate.images.tissue import Role
 from palpate.inversion import InverseProblem, LaterState
-from palpate.mechanics.boundary import outer_constraint
-from palpate.mechanics.conditions import Conditions
+from palpate.mechanics.boundary import Conditions, outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model

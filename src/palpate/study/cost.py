@@ -9,15 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage
 
-from palpate.images.distance import window_around
+from palpate.images.distance import REACH_MM, window_around
 from palpate.images.segmentation import Segmentation
 from palpate.images.surface_alignment import shown_tissues
 from palpate.images.tissue import Role
-from palpate.images.tissue_distance import REACH_MM
 from palpate.mechanics.solvers.registry import expected_of_size
-from palpate.memory import available_memory, total_memory
 from palpate.mesh import SizeField, TetMesh
 from palpate.parallel import processors
+from palpate.processes import available_memory, total_memory
 from palpate.progress import STAGES, Stage
 from palpate.study.case import Case
 from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of

@@ -12,9 +12,9 @@ from scipy import ndimage
 from palpate.errors import InputDataError
 from palpate.images.checks import OBSERVED
 from palpate.images.label_image import LabelImage
+from palpate.images.label_table import CLASSES
 from palpate.images.named_labels import MAX_NAME
 from palpate.images.tissue import Role
-from palpate.images.totalsegmentator import CLASSES
 from palpate.study.case_tissue import is_tissue_name
 from palpate.study.plausibility import TABLE, usual_stiffness
 

@@ -14,11 +14,10 @@ from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding, warning_rows
 from palpate.images.alignment import RigidMotion, fit_rigid_motion, moved, seen_surface, within_border
 from palpate.images.checks import check_pair
-from palpate.images.distance import DistanceMap, IsosurfacePoints, observation_width
+from palpate.images.distance import DistanceMap, IsosurfacePoints, observation_width, tissue_distance_map
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation, segment
 from palpate.images.tissue import Role, Tissue
-from palpate.images.tissue_distance import tissue_distance_map
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, fit_noise_model
 from palpate.study.schema import nearest

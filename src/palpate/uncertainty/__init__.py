@@ -18,9 +18,6 @@ from palpate.uncertainty.covariance import imaging_errors as imaging_errors
 from palpate.uncertainty.covariance import mesh_covariance as mesh_covariance
 from palpate.uncertainty.covariance import noise_covariance as noise_covariance
 from palpate.uncertainty.covariance import sandwich_covariance as sandwich_covariance
-from palpate.uncertainty.diagnostics import ChainDiagnostics as ChainDiagnostics
-from palpate.uncertainty.diagnostics import chain_diagnostics as chain_diagnostics
-from palpate.uncertainty.diagnostics import require_arviz as require_arviz
 from palpate.uncertainty.image_pairs import Agreement as Agreement
 from palpate.uncertainty.image_pairs import PairEstimates as PairEstimates
 from palpate.uncertainty.image_pairs import agreement as agreement
@@ -31,12 +28,15 @@ from palpate.uncertainty.intervals import ModulusInterval as ModulusInterval
 from palpate.uncertainty.intervals import discretisation_sd as discretisation_sd
 from palpate.uncertainty.intervals import log_interval as log_interval
 from palpate.uncertainty.intervals import modulus_interval as modulus_interval
-from palpate.uncertainty.joint_region import JointRegion as JointRegion
-from palpate.uncertainty.joint_region import joint_region as joint_region
+from palpate.uncertainty.profile import JointRegion as JointRegion
 from palpate.uncertainty.profile import Profile as Profile
+from palpate.uncertainty.profile import joint_region as joint_region
 from palpate.uncertainty.profile import refitted as refitted
+from palpate.uncertainty.sampling import ChainDiagnostics as ChainDiagnostics
 from palpate.uncertainty.sampling import PosteriorChains as PosteriorChains
+from palpate.uncertainty.sampling import chain_diagnostics as chain_diagnostics
 from palpate.uncertainty.sampling import posterior_chains as posterior_chains
+from palpate.uncertainty.sampling import require_arviz as require_arviz
 from palpate.uncertainty.sensitivity import Equilibria as Equilibria
 from palpate.uncertainty.sensitivity import Errors as Errors
 from palpate.uncertainty.sensitivity import FastPath as FastPath

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from palpate.images.distance import cropped, window_of
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
-from palpate.images.tissue_distance import cropped, window_of
 from palpate.inversion.hyper_parameters import of_one_noise, undecided_covariance
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.mesh.space import LagrangeSpace

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.images import readers
 from palpate.images.label_image import LabelImage
+from palpate.images.label_table import CLASSES
 from palpate.images.readers import mask_folder
-from palpate.images.totalsegmentator import CLASSES
 
 read_label_image = partial(readers.read_label_image, limits=None)
 

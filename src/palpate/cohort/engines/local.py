@@ -11,8 +11,8 @@ from palpate.cohort.engines.packing import Place, packed
 from palpate.cohort.supervise import ESTIMATE, Supervisor
 from palpate.cohort.task import Outcome, Task
 from palpate.errors import ResourceError
-from palpate.memory import available_memory
 from palpate.parallel import processors
+from palpate.processes import available_memory
 
 HERE = "here"
 UNKNOWN_GB = 1e6  # where the system does not tell what is free

@@ -17,13 +17,13 @@ from typing import Any, BinaryIO, cast
 
 import numpy as np
 
-from palpate.children import environment_of_child, name_of_end
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
 from palpate.findings import Finding, known_code
 from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import NamedLabel, printable
 from palpate.images.readers.registry import ImageFormat, StoredImage
 from palpate.images.readers.voxel_stream import MAX_VOXELS
+from palpate.processes import environment_of_child, name_of_end
 
 MAX_ANSWER = 2**24  # bytes of the line that goes before the voxels
 DTYPE, DIGEST = re.compile(r"[<>|][iuf][1248]"), re.compile(r"[0-9a-f]{64}")

@@ -12,12 +12,12 @@ import numpy as np
 
 from palpate.errors import InputDataError
 from palpate.images.label_image import corners_apart
+from palpate.images.label_table import CLASSES
 from palpate.images.named_labels import NamedLabel, printable
 from palpate.images.readers.dicom import refused_series
 from palpate.images.readers.merged_masks import Mask, merged
 from palpate.images.readers.registry import FOLDER, ImageFormat, StoredImage, format_of, marked_format, register
 from palpate.images.readers.values import label_values
-from palpate.images.totalsegmentator import CLASSES
 
 ENDINGS = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd")
 MOST_FILES = 10_000  # of any kind in the folder

@@ -14,8 +14,8 @@ from multifrontal import NotPositiveDefinite
 from palpate.errors import ResourceError, SolverError
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
 from palpate.mechanics.solvers.contract import EXACT, Expectation, Factorisation, Factoriser, Hints, Solver
-from palpate.memory import available_memory
 from palpate.parallel import processors
+from palpate.processes import available_memory
 
 HOPELESS = 4.0  # times the free memory; a pattern of such a size is not analysed to know more exactly
 MAX_REFINEMENTS = 8  # steps of conjugate gradients; where they do not suffice, double precision costs less

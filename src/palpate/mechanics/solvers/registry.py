@@ -12,7 +12,7 @@ from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.solvers import direct, multigrid
 from palpate.mechanics.solvers.conjugate_gradients import times
 from palpate.mechanics.solvers.contract import EXACT, Coarser, Expectation, Factorisation, Hints
-from palpate.memory import available_memory, total_memory
+from palpate.processes import available_memory, total_memory
 
 SOLVERS = {solver.name: solver for solver in (direct.SOLVER, direct.MIXED, multigrid.SOLVER)}
 TOLERANCE = 1e-8  # of a residual, relative to its right-hand side, which rounding may leave

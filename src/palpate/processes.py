@@ -1,9 +1,13 @@
-"""Memory: what this machine has, and what of it a computation may still take."""
+"""Processes: what memory the machine has left for one, what our own begin with, and how they ended.
+
+What stands here every image that is read waits for: no library does.
+"""
 
 from __future__ import annotations
 
 import os
 import re
+import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -74,3 +78,15 @@ def _of_machine(line: str, machine: Path) -> float | None:
         return next(float(found.split()[1]) for found in lines if found.startswith(line)) * 1024.0
     except (OSError, StopIteration, ValueError):
         return None
+
+
+def environment_of_child() -> dict[str, str]:
+    """The environment of a process of ours: our places to import from, and one thread."""
+    places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    return {**os.environ, **threads, "PYTHONPATH": places}
+
+
+def name_of_end(code: int) -> str:
+    """The signal, or the exit code, by which a process ended."""
+    return {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")
