@@ -13,7 +13,7 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
 from palpate.uncertainty import FittedState
 from palpate.uncertainty.intervals import NORMAL_95
-from palpate.uncertainty.profile import LEVEL
+from palpate.uncertainty.profile import JOINT_LEVEL
 from palpate.unknowns import layer_blocks
 
 NOISE = NoiseModel(np.array([0.1**2]), np.array([3.0]))
@@ -84,7 +84,7 @@ def test_a_region_reaches_along_each_axis_as_far_as_the_interval_beside_it(found
     own = half_widths([e.interval95 for e in found.estimates]) / NORMAL_95
     for edge in (region.boundary, region.ellipse):
         ends = zip(np.min(edge, axis=0), np.max(edge, axis=0), strict=True)
-        assert half_widths(ends) / LEVEL == pytest.approx(own, rel=0.1)
+        assert half_widths(ends) / JOINT_LEVEL == pytest.approx(own, rel=0.1)
 
 
 def test_samples_have_the_interval_of_the_estimate(found):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.inversion import Bounds, fixed_correspondence, gauss_newton
-from palpate.uncertainty.profile import DIRECTIONS, LEVEL, joint_region, profile
+from palpate.uncertainty.profile import DIRECTIONS, JOINT_LEVEL, joint_region, profile
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
 
@@ -28,29 +28,31 @@ def region(fixed, minimum, covariance):
 
 def test_the_ellipse_is_that_of_the_covariance(region, minimum, covariance):
     away = region.ellipse - minimum.unknowns[:2]
-    assert np.einsum("na,ab,nb->n", away, np.linalg.inv(covariance), away) == pytest.approx([LEVEL**2] * DIRECTIONS)
-    assert pytest.approx(5.991, abs=1e-3) == LEVEL**2
+    assert np.einsum("na,ab,nb->n", away, np.linalg.inv(covariance), away) == pytest.approx(
+        [JOINT_LEVEL**2] * DIRECTIONS
+    )
+    assert pytest.approx(5.991, abs=1e-3) == JOINT_LEVEL**2
 
 
 def test_where_the_model_is_straight_the_region_is_the_ellipse(objective, minimum, covariance, straight):
     fixed = fixed_correspondence(straight(objective, minimum), minimum.unknowns, minimum.evaluation)
     found = joint_region(fixed, minimum, (0, 1), covariance=covariance, bounds=WIDE)
-    assert np.abs((found.boundary - found.ellipse) / np.sqrt(np.diag(covariance))).max() < 0.02 * LEVEL
+    assert np.abs((found.boundary - found.ellipse) / np.sqrt(np.diag(covariance))).max() < 0.02 * JOINT_LEVEL
     assert not found.open
 
 
 def test_the_shadow_of_the_region_is_the_profile_at_its_level(region, fixed, minimum, covariance):
     """The largest value of a modulus in the region is where its own profile has the same deviance."""
     for i in range(2):
-        alone = profile(fixed, minimum, i, variance=covariance[i, i], bounds=WIDE, level=LEVEL)
-        half = LEVEL * np.sqrt(covariance[i, i])
+        alone = profile(fixed, minimum, i, variance=covariance[i, i], bounds=WIDE, level=JOINT_LEVEL)
+        half = JOINT_LEVEL * np.sqrt(covariance[i, i])
         assert region.boundary[:, i].max() == pytest.approx(alone.high, abs=0.12 * half)
         assert region.boundary[:, i].min() == pytest.approx(alone.low, abs=0.12 * half)
         assert abs(alone.high + alone.low - 2.0 * minimum.unknowns[i]) > 0.03 * half  # it leans
 
 
 def test_bounds_cut_the_region_and_it_says_so(fixed, minimum, covariance, region):
-    upper = minimum.unknowns[:2] + 0.5 * LEVEL * np.sqrt(np.diag(covariance))
+    upper = minimum.unknowns[:2] + 0.5 * JOINT_LEVEL * np.sqrt(np.diag(covariance))
     cut = joint_region(fixed, minimum, (0, 1), covariance=covariance, bounds=Bounds(WIDE.lower, upper))
     assert cut.open
     assert not region.open

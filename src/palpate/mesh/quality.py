@@ -26,7 +26,7 @@ LEVEL_SET_TOLERANCE = 0.01
 VOXEL_TOLERANCE = 0.03
 COARSE_CELL_MM = 8.0
 LEAST_SLOPE = 0.25  # of a level set next to its surface, where two surfaces of an organ nearly meet
-FINE_CELLS = 8  # fine cells along the side of a coarse one
+HALVINGS = 4  # of the cells that a surface crosses
 
 
 def in_words(point: NDArray[np.float64], grid: VoxelGrid | None) -> str:
@@ -165,31 +165,29 @@ def check_mesh(
 def level_set_volumes(anatomy: Anatomy) -> dict[str, float]:
     """Volume (mm^3) of each tissue inside the box, from the level sets alone: tissue name -> mm^3.
 
-    Cells of 8 mm that a surface crosses are divided into 1 mm ones, these again into halves where a surface crosses
-    them; of a cell the share clip(1/2 - d / edge, 0, 1) counts as inside, d the distance to the surface.
+    Cells of 8 mm that a surface crosses are halved, and their parts again, to 1/2 mm; of a cell of 1 mm and less the
+    share clip(1/2 - d / edge, 0, 1) counts as inside, d the distance to the surface.
     """
-    lengths = anatomy.box.lengths
-    counts = np.ceil(lengths / COARSE_CELL_MM).astype(int)
-    size = lengths / counts
-    centres = _cell_centres(counts) * size
-    values = anatomy.values(anatomy.box.world(centres))
-    reach = float(np.linalg.norm(size))
-    cell = float(np.prod(size))
-    crossed = (np.abs(values) < reach).any(axis=0)
-    total = cell * _shares(values[:, ~crossed], 1e-9).sum(axis=1)
-    edge = cell ** (1 / 3) / FINE_CELLS
+    counts = np.ceil(anatomy.box.lengths / COARSE_CELL_MM).astype(int)
+    coarse = anatomy.box.lengths / counts
+    centres = _cell_centres(counts) * coarse
 
-    def divided(block: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Volumes (n_tissues,) mm^3 in crossed cells (n,), by number."""
-        local, inside = _divided(anatomy, centres[block], values[:, block], FINE_CELLS, size, within_mm=reach)
-        near = (np.abs(inside) < edge).any(axis=0)
-        within = cell / FINE_CELLS**3 * _shares(inside[:, ~near], edge).sum(axis=1)
-        fine = size / FINE_CELLS
-        _, inside = _divided(anatomy, local[near], inside[:, near], 2, fine, within_mm=float(np.linalg.norm(fine)))
-        return np.asarray(within + cell / (2 * FINE_CELLS) ** 3 * _shares(inside, 0.5 * edge).sum(axis=1))
+    def volumes(block: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Volumes (n_tissues,) mm^3 in coarse cells (n,), by number."""
+        local, size, total = centres[block], coarse, np.zeros(len(anatomy.tissues))
+        values = anatomy.values(anatomy.box.world(local))
+        for halving in range(HALVINGS):
+            cell, reach = float(np.prod(size)), float(np.linalg.norm(size))
+            near, edge = (reach, 1e-9) if halving < HALVINGS - 1 else (cell ** (1 / 3),) * 2
+            crossed = (np.abs(values) < near).any(axis=0)
+            total += cell * _shares(values[:, ~crossed], edge).sum(axis=1)
+            local, values = _divided(anatomy, local[crossed], values[:, crossed], size, within_mm=reach)
+            size = 0.5 * size
+        cell = float(np.prod(size))
+        return np.asarray(total + cell * _shares(values, cell ** (1 / 3)).sum(axis=1))
 
-    blocks = np.array_split(np.flatnonzero(crossed), max(1, int(crossed.sum()) // 200))
-    total += np.sum(mapped(divided, blocks), axis=0)
+    blocks = np.array_split(np.arange(len(centres)), max(1, len(centres) // 1000))
+    total = np.sum(mapped(volumes, blocks), axis=0)
     order = (*anatomy.priority, anatomy.filler)
     return {anatomy.tissues[i].name: float(total[rank]) for rank, i in enumerate(order)}
 
@@ -198,26 +196,25 @@ def _divided(
     anatomy: Anatomy,
     centres: NDArray[np.float64],
     values: NDArray[np.float64],
-    n: int,
     size: NDArray[np.float64],
     *,
     within_mm: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Centres (n^3 n_cells, 3) mm along the box's axes of the n^3 parts of each cell, and distances to surfaces there.
+    """Centres (8 n_cells, 3) mm along the box's axes of the eighths of each cell, and distances to surfaces there.
 
     `centres` (n_cells, 3), `values` (n_surfaces, n_cells) mm and `size` (3,) mm are the cells'; a distance is new where
     the cell's own is less than `within_mm`: |phi| / |grad phi| next to the surface, where phi alone would be a bias.
     """
-    parts = (_cell_centres(np.full(3, n)) / n - 0.5) * size
+    parts = (_cell_centres(np.full(3, 2)) / 2 - 0.5) * size
     local = (centres[:, None] + parts).reshape(-1, 3)
-    points, inside = anatomy.box.world(local), np.repeat(values, n**3, axis=1)
+    points, inside = anatomy.box.world(local), np.repeat(values, 8, axis=1)
     for rank, tissue in enumerate(anatomy.priority):
-        near, phi = np.abs(inside[rank]) < within_mm, anatomy.level_sets[tissue]
-        if phi is None or not near.any():
+        near, phi = np.flatnonzero(np.abs(inside[rank]) < within_mm), anatomy.level_sets[tissue]
+        if phi is None or not len(near):
             continue
         distance = phi.at(points[near])
-        close = np.abs(distance) < float(size.max()) / n
-        slope = np.linalg.norm(phi.gradient_at(points[near][close]), axis=1)
+        close = np.abs(distance) < 0.5 * float(size.max())
+        slope = np.linalg.norm(phi.gradient_at(points[near[close]]), axis=1)
         distance[close] /= np.maximum(slope, LEAST_SLOPE)
         inside[rank, near] = distance
     return local, inside
