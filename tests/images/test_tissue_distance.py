@@ -78,3 +78,16 @@ def test_the_window_ends_at_the_images_border():
 def test_a_tissue_that_is_not_in_the_image_is_named(segmentation):
     with pytest.raises(InputDataError, match="'lost' has no voxel"):
         tissue_distance_map(segmentation, 2, smoothing_mm=0.9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_window_is_the_least_box_that_holds_a_mask_and_its_margin_within_the_image(seed):
+    rng = np.random.default_rng(seed)
+    mask = np.zeros(tuple(rng.integers(4, 20, 3)), dtype=bool)
+    mask[tuple(rng.integers(0, n, 3) for n in mask.shape)] = True
+    grid = VoxelGrid(mask.shape, np.diag([1.0, 2.0, 1.5, 1.0]))
+    tight, wide = window_around(mask, grid), window_around(mask, grid, reach_mm=3.2)
+    assert np.count_nonzero(mask[tight]) == np.count_nonzero(mask)
+    assert all(mask[tight].any(axis=tuple({0, 1, 2} - {a}))[[0, -1]].all() for a in range(3))
+    for inner, outer, margin, n in zip(tight, wide, (4, 2, 3), mask.shape, strict=True):
+        assert (outer.start, outer.stop) == (max(inner.start - margin, 0), min(inner.stop + margin, n))

@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from palpate.errors import InputDataError
 from palpate.findings import Finding
+from palpate.images.distance import window_around
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
@@ -120,11 +121,11 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
     for i, tissue in enumerate(segmentation.tissues):
         if tissue.role not in OBSERVED:
             continue
-        box = ndimage.find_objects(segmentation.mask(i).astype(np.int8))
-        if not box:
+        mask = segmentation.mask(i)
+        if not mask.any():
             continue  # a tissue that is absent is refused by check_pair
         if tissue.role is not Role.RIGID:
-            mask = segmentation.mask(i)
+            box = window_around(mask, segmentation.grid)
             if touching := _touching(mask):
                 share = f"{touching / (touching + sum(_faces(mask))):.1%}"
                 text = (
@@ -132,8 +133,8 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
                     " which says nothing about its stiffness; a larger field of view is better"
                 )
                 findings.append(Finding("cut-by-border", text, tissue.name, f"in '{name}' ({share})"))
-            findings += _too_thin(segmentation.index == i, box[0], tissue, name)
-            parts, count = ndimage.label(segmentation.index[box[0]] == i, structure=np.ones((3, 3, 3)))
+            findings += _too_thin(segmentation.index == i, box, tissue, name)
+            parts, count = ndimage.label(segmentation.index[box] == i, structure=np.ones((3, 3, 3)))
             if count > 1:
                 sizes = np.sort(np.bincount(parts.ravel())[1:])
                 text = (

@@ -135,14 +135,15 @@ def distance_map(mask: NDArray[np.bool_], grid: VoxelGrid, *, smoothing_mm: floa
     return DistanceMap(ndimage.spline_filter(values, order=3, mode="mirror"), grid, smoothing_mm)
 
 
-def window_around(mask: NDArray[np.bool_], grid: VoxelGrid, *, reach_mm: float) -> tuple[slice, slice, slice]:
+def window_around(mask: NDArray[np.bool_], grid: VoxelGrid, *, reach_mm: float = 0.0) -> tuple[slice, slice, slice]:
     """Index ranges of the voxels within `reach_mm` of the box around `mask` (n_x, n_y, n_z), which is not empty."""
-    found = ndimage.find_objects(mask.astype(np.int8))[0]
-    margin = np.ceil(reach_mm / grid.spacing).astype(int)
-    i, j, k = (
-        slice(max(s.start - m, 0), min(s.stop + m, n)) for s, m, n in zip(found, margin, mask.shape, strict=True)
-    )
-    return (i, j, k)
+    window = [slice(None)] * 3
+    for axis, reach in enumerate(np.ceil(reach_mm / grid.spacing).astype(int)):
+        others = tuple(a for a in range(3) if a != axis)
+        # what lies beyond the axes before is empty
+        there = np.flatnonzero(mask[tuple(window)].any(axis=others))
+        window[axis] = slice(max(int(there[0]) - reach, 0), min(int(there[-1]) + 1 + reach, mask.shape[axis]))
+    return (window[0], window[1], window[2])
 
 
 def terrace_power(distance: DistanceMap, normals: NDArray[np.float64]) -> NDArray[np.float64]:

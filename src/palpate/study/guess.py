@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from palpate.errors import InputDataError
 from palpate.images.checks import OBSERVED
+from palpate.images.distance import window_around
 from palpate.images.label_image import LabelImage
 from palpate.images.label_table import CLASSES
 from palpate.images.named_labels import MAX_NAME
@@ -163,9 +164,7 @@ def _with_driver(guesses: list[GuessedTissue], before: LabelImage, after: Sequen
 def _gap(image: LabelImage, labels: tuple[int, ...], organ: tuple[int, ...]) -> float:
     """Least distance of the organ's voxels to those of `labels`, mm; infinite where it is more than NEAR_MM."""
     inside = np.isin(image.labels, organ)
-    margin = np.ceil(NEAR_MM / image.grid.spacing).astype(int)
-    box = ndimage.find_objects(inside.astype(np.int8))[0]
-    window = tuple(slice(max(s.start - m, 0), s.stop + m) for s, m in zip(box, margin, strict=True))
+    window = window_around(inside, image.grid, reach_mm=NEAR_MM)
     others = np.isin(image.labels[window], labels)
     if not others.any():
         return float("inf")

@@ -12,6 +12,7 @@ from scipy import ndimage
 from palpate.errors import GeometryError, InputDataError, ResourceError
 from palpate.findings import Finding
 from palpate.images.checks import SMALL_VOXELS, VOLUME_IMPLAUSIBLE
+from palpate.images.distance import window_around
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.mechanics.element import largest_strains
@@ -39,7 +40,7 @@ def refuse_unmeshable(segmentation: Segmentation, name: str) -> None:
                 f"'{tissue.name}' has only {count} voxels in '{name}', and {SMALL_VOXELS} are the least that a"
                 " surface can be made of: use finer images, or join it to its neighbour"
             )
-        box = ndimage.find_objects(mask.astype(np.int8))[0]
+        box = window_around(mask, segmentation.grid)
         if not ndimage.binary_erosion(mask[box], np.ones((2, 2, 2), dtype=bool)).any():
             raise GeometryError(
                 f"'{tissue.name}' is nowhere two voxels thick in '{name}' ({count} voxels); such a sheet has no inside"
