@@ -1,7 +1,8 @@
 """Independent work on several processors: NumPy, SciPy and libigl leave Python's lock while they compute.
 
-The threads are ours; BLAS's own only wait for each other, so that its limit is one while ours compute
-(`multifrontal.blas_on_one_thread`).
+The threads are ours, as many as the `processors` that this process may use; BLAS's own only wait for each other, so
+that its limit is one while ours compute (`multifrontal.blas_on_one_thread`). On one processor nothing waits for a
+thread.
 """
 
 from __future__ import annotations
