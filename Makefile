@@ -1,6 +1,7 @@
 # Everything runs inside .venv, which each target makes when it is missing or older than pyproject.toml. Modules are
-# compiled when they are imported: compiling all that comes along takes two fifths of the installation. What has been
-# compiled is kept in .venv, also where the shell says otherwise: else every process would compile it anew.
+# compiled when they are imported: compiling all that comes along takes two fifths of the installation. An old pip takes
+# twice the time of a new one, but does where none is to be had. What has been compiled is kept in .venv, also where the
+# shell says otherwise: else every process would compile it anew.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -12,7 +13,8 @@ install: $(VENV)/.installed
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable ".[dev]"
+	-$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile --upgrade pip
+	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile --editable ".[dev]"
 	touch $@
 
 # Intel's PARDISO alone, which benchmarks/speed.py --parts solver compares our solver with; nothing else uses it.
