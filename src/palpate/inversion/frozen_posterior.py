@@ -19,6 +19,8 @@ from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.reduced import ReducedModel
 
+ONE = np.ones(1)  # the coordinate of what no unknown moves
+
 
 @dataclass(frozen=True, slots=True)
 class FixedCorrespondence:
@@ -109,10 +111,9 @@ class FrozenState:
         coefficients: NDArray[np.float64],
         offsets: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Z (..., k) of amplitudes (..., m), moduli (..., n_regions) kPa, coefficients and offsets (..., n_offsets)."""
+        """Z (k,) of the amplitude (m,) at moduli (n_regions,) kPa, coefficients (n_modes,) and offsets (n_offsets,)."""
         further = [] if self.expanded is None else [np.log(moduli / self.expanded)]
-        one = np.ones((*amplitude.shape[:-1], 1))  # the coordinate of what no unknown moves
-        return np.concatenate([amplitude, coefficients, *further, offsets, one], axis=-1)
+        return np.concatenate([amplitude, coefficients, *further, offsets, ONE])
 
     def transposed_times(
         self, values: NDArray[np.float64], amplitude_slopes: NDArray[np.float64], modulus_slopes: NDArray[np.float64]
@@ -146,17 +147,16 @@ class FrozenPosterior:
         """Number of log-moduli among the unknowns."""
         return self.objective.n_parameters
 
-    def values(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Its values alone (k,) at k unknowns (k, n); raises `SolverError` where a stiffness is indefinite."""
+    def value(self, unknowns: NDArray[np.float64]) -> float:
+        """Its value alone at unknowns (n,); raises `SolverError` where a reduced stiffness is not positive definite."""
         parameters = self.objective.parameters
-        moduli, away, one = parameters.moduli(unknowns), unknowns - parameters.prior_centre, np.ones((len(unknowns), 1))
-        total = 0.5 * np.einsum("kn,kn->k", away @ self.prior, away)
+        moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
+        total = 0.5 * float(away @ self.prior @ away)
         for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
-            given = np.concatenate([coefficients[:, : state.reduced.n_boundary], one], axis=1)
-            amplitudes = state.reduced.amplitudes(moduli, given)
-            z = state.coordinates(amplitudes, moduli, coefficients, parameters.offsets(unknowns, s))
-            total = total + 0.5 * np.einsum("kn,kn->k", z @ state.form, z)
-        return np.asarray(total)
+            amplitude = state.reduced.amplitude(moduli, np.append(coefficients[: state.reduced.n_boundary], ONE))
+            z = state.coordinates(amplitude, moduli, coefficients, parameters.offsets(unknowns, s))
+            total += 0.5 * float(z @ (state.form @ z))
+        return total
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """Its value, score and Gauss-Newton matrix at unknowns (n,), without residuals; raises `SolverError`.

@@ -87,22 +87,18 @@ class ReducedModel:
         """Equilibrium at moduli (n_regions,) kPa and mode coefficients (n_modes,); raises `SolverError`."""
         return self.system(moduli).solve(coefficients)
 
-    def amplitudes(self, moduli: NDArray[np.float64], given: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Basis coefficients (n, m) alone, at moduli (n, n_regions) kPa and [q, 1] (n, n_boundary + 1) of n equilibria.
+    def amplitude(self, moduli: NDArray[np.float64], given: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Basis coefficients (m,) alone, at moduli (n_regions,) kPa and [q, 1] (n_boundary + 1,); raises `SolverError`.
 
-        Nothing else is checked or kept: it is the fast way of those who ask ten thousands of times. Raises
-        `SolverError`.
+        Nothing is checked: it is the fast way of those who ask ten thousands of times.
         """
-        n, n_regions = moduli.shape
-        stiffness = (moduli @ self.stiffness.reshape(n_regions, -1)).reshape(n, self.n_basis, -1)
-        coupling = (moduli @ self.coupling.reshape(n_regions, -1)).reshape(n, self.n_basis, -1)
-        found = (coupling @ given[:, :, None])[:, :, 0] - self.load
-        for number, (matrix, force) in enumerate(zip(stiffness, found, strict=True)):
-            # a symmetric matrix is its own transpose, which LAPACK takes without a copy
-            _, found[number], failed = linalg.lapack.dposv(matrix.T, force, overwrite_a=1, overwrite_b=1)
-            if failed:
-                raise self._indefinite(moduli[number])
-        return np.asarray(-found)
+        force = moduli @ (self.coupling @ given) - self.load
+        stiffness = (moduli @ self.stiffness.reshape(len(moduli), -1)).reshape(self.n_basis, -1)
+        # a symmetric matrix is its own transpose, which LAPACK takes without a copy
+        _, solution, failed = linalg.lapack.dposv(stiffness.T, force, overwrite_a=1, overwrite_b=1)
+        if failed:
+            raise self._indefinite(moduli)
+        return np.asarray(-solution)
 
     def responses(self, moduli: NDArray[np.float64]) -> NDArray[np.float64]:
         """Outputs (n_outputs, n_modes + 1) mm for each unit mode and, last, for offset and loads; `SolverError`."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 
@@ -79,19 +78,24 @@ def posterior_chains(
     with determined():
         own = np.linalg.cholesky(evaluation.covariance_columns(n)[:n])
         stretch = np.asarray(np.linalg.cholesky(covariance) @ np.linalg.inv(own), dtype=np.float64)
-    generators = rng.spawn(chains)
-    now = start + SPREAD * np.concatenate([laplace.draws(1, generator) for generator in generators])
-    inside = np.clip(start[:n] + (now[:, :n] - start[:n]) @ stretch.T, bounds.lower, bounds.upper)
-    now[:, :n] = start[:n] + SHRUNK * np.linalg.solve(stretch, (inside - start[:n]).T).T
-    target = _Target(straight, laplace, bounds, stretch)
     warm, steps = THIN * (draws // 10), THIN * draws
-    parts, accepted = [], np.zeros(chains)
-    for done in range(0, warm + steps, BLOCK):
-        *part, now, taken = _walked(target, now, steps=min(BLOCK, warm + steps - done), generators=generators)
-        parts.append(part)
-        accepted += taken
-    theta, energy = (np.concatenate(each, axis=1)[:, warm + THIN - 1 :: THIN] for each in zip(*parts, strict=True))
-    return PosteriorChains(theta, -energy, accepted / (warm + steps))
+    found = []
+    for generator in rng.spawn(chains):
+        now = start + SPREAD * laplace.draws(1, generator)[0]
+        inside = np.clip(start[:n] + stretch @ (now[:n] - start[:n]), bounds.lower, bounds.upper)
+        now[:n] = start[:n] + SHRUNK * np.linalg.solve(stretch, inside - start[:n])
+        parts, accepted = [], 0
+        for done in range(0, warm + steps, BLOCK):
+            several = min(BLOCK, warm + steps - done)
+            *part, now, taken = _chain(
+                straight, laplace, now, bounds=bounds, steps=several, rng=generator, stretch=stretch
+            )
+            parts.append(part)
+            accepted += taken
+        theta, energy = (np.concatenate(each)[warm + THIN - 1 :: THIN] for each in zip(*parts, strict=True))
+        found.append((theta, -energy, accepted / (warm + steps)))
+    thetas, densities, shares = zip(*found, strict=True)
+    return PosteriorChains(np.stack(thetas), np.stack(densities), np.array(shares))
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,16 +112,14 @@ class _Straight:
         found[self.columns] = in_series_slopes(unknowns[self.columns], self.shares)
         return found
 
-    def energies(self, straight: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Minus the log-density (k,) at z (k, n_unknowns), of z and of x; infinite where there is no x."""
-        unknowns, found = straight.copy(), np.full((2, len(straight)), np.inf)
-        unknowns[:, self.columns] = of_series(straight[:, self.columns], self.shares)
-        there = np.isfinite(unknowns[:, self.columns]).all(axis=1)
-        if there.any():
-            slopes = in_series_slopes(unknowns[there][:, self.columns], self.shares)
-            found[1, there] = self.frozen.values(unknowns[there])
-            found[0, there] = found[1, there] + np.log(slopes).sum(axis=1)
-        return found[0], found[1]
+    def energy(self, straight: NDArray[np.float64]) -> tuple[float, float]:
+        """Minus the log-density at z (n_unknowns,), of z and of x; infinite where there is no x."""
+        unknowns = straight.copy()
+        unknowns[self.columns] = of_series(straight[self.columns], self.shares)
+        if not np.isfinite(unknowns).all():
+            return np.inf, np.inf
+        value = self.frozen.value(unknowns)
+        return value + float(np.log(self.slopes(unknowns)[self.columns]).sum()), value
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,10 +129,10 @@ class _Laplace:
     centre: NDArray[np.float64]
     factor: NDArray[np.float64]
 
-    def energies(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """1/2 (x - c)^T H (x - c) (k,) of unknowns x (k, n_unknowns), dimensionless."""
-        scaled = (unknowns - self.centre) @ self.factor
-        return np.asarray(0.5 * np.einsum("kn,kn->k", scaled, scaled))
+    def energy(self, unknowns: NDArray[np.float64]) -> float:
+        """1/2 (x - c)^T H (x - c) of unknowns x (n_unknowns,), dimensionless."""
+        scaled = self.factor.T @ (unknowns - self.centre)
+        return 0.5 * float(scaled @ scaled)
 
     def draws(self, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
         """Samples (n, n_unknowns) of N(0, H^-1)."""
@@ -138,56 +140,37 @@ class _Laplace:
         return np.asarray(linalg.solve_triangular(self.factor.T, normal, lower=False).T)
 
 
-@dataclass(frozen=True, slots=True)
-class _Target:
-    """What chains are drawn from; `stretch` (n_parameters, n_parameters): A of `posterior_chains`."""
+def _chain(
+    straight: _Straight,
+    laplace: _Laplace,
+    start: NDArray[np.float64],
+    *,
+    bounds: Bounds,
+    steps: int,
+    rng: np.random.Generator,
+    stretch: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], int]:
+    """So many steps from unknowns z (n,); `stretch` (n_parameters, n_parameters): A of `posterior_chains`.
 
-    straight: _Straight
-    laplace: _Laplace
-    bounds: Bounds
-    stretch: NDArray[np.float64]
-
-    def stretched(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log-moduli (..., n_parameters) of unknowns z (..., n_unknowns)."""
-        centre = self.laplace.centre[: len(self.stretch)]
-        return np.asarray(centre + (unknowns[..., : len(centre)] - centre) @ self.stretch.T)
-
-    def energies(self, unknowns: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Of unknowns z (k, n): minus the log-density over that of the proposals, and minus that of x, (k,) each.
-
-        Infinite beyond the bounds.
-        """
-        stretched, above, value = self.stretched(unknowns), *np.full((2, len(unknowns)), np.inf)
-        inside = np.all((stretched >= self.bounds.lower) & (stretched <= self.bounds.upper), axis=1)
-        if inside.any():
-            own, value[inside] = self.straight.energies(unknowns[inside])
-            above[inside] = own - self.laplace.energies(unknowns[inside])
-        return above, value
-
-
-def _walked(
-    target: _Target, start: NDArray[np.float64], *, steps: int, generators: Sequence[np.random.Generator]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """So many steps of chains side by side from unknowns z (chains, n).
-
-    Their log-moduli (chains, steps, n_parameters), minus their log-density (chains, steps) before log-moduli are
-    stretched, the ends (chains, n), and how many proposals of each were taken.
+    Their log-moduli (steps, n_parameters), minus their log-density (steps,) before log-moduli are stretched, the end
+    (n,), and how many proposals were taken.
     """
-    centre, now = target.laplace.centre, start
-    found, energy = np.empty((steps, len(now), len(target.stretch))), np.empty((steps, len(now)))
-    level, value = target.energies(now)
-    draws = np.stack([target.laplace.draws(steps, generator) for generator in generators])
-    thresholds = np.log(np.stack([generator.random(steps) for generator in generators]))
-    accepted = np.zeros(len(now), dtype=np.int64)
+    centre = laplace.centre[: len(stretch)]
+    n = len(centre)
+    theta, energy, accepted = np.empty((steps, n)), np.empty(steps), 0
+    now, (own, value) = start, straight.energy(start)
+    level = own - laplace.energy(start)
+    draws, thresholds = laplace.draws(steps, rng), np.log(rng.random(steps))
     for k in range(steps):
-        trial = centre + np.sqrt(1.0 - STEP**2) * (now - centre) + STEP * draws[:, k]
-        above, there = target.energies(trial)
-        taken = thresholds[:, k] < level - above
-        now = np.where(taken[:, None], trial, now)
-        level, value = np.where(taken, above, level), np.where(taken, there, value)
-        accepted += taken
-        found[k], energy[k] = now[:, : found.shape[2]], value
-    return target.stretched(found).swapaxes(0, 1), energy.T, now, accepted
+        trial = laplace.centre + np.sqrt(1.0 - STEP**2) * (now - laplace.centre) + STEP * draws[k]
+        stretched = centre + stretch @ (trial[:n] - centre)
+        if np.all((stretched >= bounds.lower) & (stretched <= bounds.upper)):
+            own, there = straight.energy(trial)
+            above = own - laplace.energy(trial)
+            if thresholds[k] < level - above:
+                now, value, level, accepted = trial, there, above, accepted + 1
+        theta[k], energy[k] = centre + stretch @ (now[:n] - centre), value
+    return theta, energy, now, accepted
 
 
 @dataclass(frozen=True, slots=True)

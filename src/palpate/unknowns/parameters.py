@@ -217,18 +217,17 @@ class ParameterMap:
         return np.concatenate([self.prior_mean, of_blocks])
 
     def moduli(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Moduli (..., n_regions) kPa at unknowns (..., n_unknowns), or at theta (..., n_parameters) alone.
+        """The regions' moduli (n_regions,) kPa at unknowns (n_unknowns,), or at theta (n_parameters,) alone.
 
         Young's, or those of the parts of the stiffness where Poisson's ratio is open.
         """
-        logarithms = unknowns[..., : self.n_parameters] @ self.selection.T
-        if unknowns.shape[-1] > self.n_parameters:
-            changes = in_series(unknowns[..., self.acting_on_moduli], self.shares_on_moduli)
-            logarithms = logarithms + changes @ self._layout.of_regions.T
+        logarithms = self.selection @ unknowns[: self.n_parameters]
+        if len(unknowns) > self.n_parameters:
+            changes = in_series(self._on_moduli(unknowns), self.shares_on_moduli)
+            logarithms = logarithms + self._layout.of_regions @ changes
         moduli = np.asarray(self.base * np.exp(logarithms))
         for open_ in self.poisson:
-            weights = [open_.weights(x)[0] for x in unknowns.reshape(-1, unknowns.shape[-1])]
-            moduli[..., list(open_.regions)] *= np.reshape(weights, (*unknowns.shape[:-1], -1))
+            moduli[list(open_.regions)] *= open_.weights(unknowns)[0]
         return moduli
 
     def derivatives(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -258,12 +257,12 @@ class ParameterMap:
         return unknowns[own] if len(unknowns) > self.n_parameters else np.zeros(len(own))
 
     def coefficients(self, unknowns: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """What the model of each state takes beside the moduli (..., n_modes): boundary, then material modes."""
-        return [unknowns[..., self._model_columns(state)] for state in range(self.n_states)]
+        """What the model of each state takes beside the moduli (n_modes,): boundary modes, then material modes."""
+        return [unknowns[self._model_columns(state)] for state in range(self.n_states)]
 
     def offsets(self, unknowns: NDArray[np.float64], state: int) -> NDArray[np.float64]:
-        """What is added to the residuals of those observations of a state that have an offset (..., n_offsets)."""
-        return np.asarray(unknowns[..., self.acting(Acts.RESIDUALS, state)])
+        """What is added to the residuals of those observations of a state that have an offset (n_offsets,)."""
+        return np.asarray(unknowns[self.acting(Acts.RESIDUALS, state)])
 
     def offset_names(self, state: int) -> list[str]:
         """Names of the observations of a state that have an offset, in the order of these."""
