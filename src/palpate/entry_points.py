@@ -17,7 +17,7 @@ def brought(group: str, kind: type[T], *, taken: Container[str] = ()) -> dict[st
     Raises `ConfigurationError` for one that cannot be imported, is of another kind or has a name that is taken.
     """
     found: dict[str, T] = {}
-    metadata = import_module("importlib.metadata")  # a sixth of what a process takes that reads an image
+    metadata = import_module("importlib.metadata")  # which a process that reads an image does without
     for point in metadata.entry_points(group=group):
         package = point.dist.name if point.dist else "a package"
         told = f"{package} brings {point.name} ({group}), but {{}}; update that package, or uninstall it"

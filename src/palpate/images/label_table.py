@@ -33,11 +33,10 @@ from palpate.images.named_labels import (
 # The classes of TotalSegmentator's tasks `total` (version 2, CT) and `total_mr`: facts, from its table `class_map`
 # (https://github.com/wasserth/TotalSegmentator, totalsegmentator/map_to_binary.py). A class's number is its place in
 # the list, from 1. No class of either task is the rectum.
+TOTALSEGMENTATOR = resources.files("palpate.images") / "totalsegmentator.json"
 CLASSES: Mapping[str, Mapping[str, int]] = {
     task: {name: number for number, name in enumerate(names, start=1)}
-    for task, names in json.loads(
-        (resources.files("palpate.images") / "totalsegmentator.json").read_text("utf-8")
-    ).items()
+    for task, names in json.loads(TOTALSEGMENTATOR.read_text("utf-8")).items()
 }
 MAX_BYTES = 2**20
 COLOUR = re.compile(r"#[0-9a-f]{6}")

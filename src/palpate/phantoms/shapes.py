@@ -140,7 +140,7 @@ class Tube:
     def _bend(
         self, place: NDArray[np.float64], spoke: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """C' (n, 3) mm and |c'|^2 - (p - c) . c'' (n,) mm^2 at places (n,), but no less than a fifth of |c'|^2."""
+        """Slopes c' (n, 3) mm and |c'|^2 - (p - c) . c'' (n,) mm^2 at places (n,), at least a fifth of |c'|^2."""
         slope = self.curve(place, 1)
         square = np.einsum("ni,ni->n", slope, slope)
         bend = square - np.einsum("ni,ni->n", spoke, self.curve(place, 2))

@@ -197,5 +197,5 @@ def _write(path: Path, values: NDArray[Any], grid: VoxelGrid, *, intent: str = "
         ) from error
 
 
-# two thirds of nibabel's import
+# half of nibabel's import and more
 register(ImageFormat("NIfTI", (".nii", ".nii.gz"), read_nifti, needless=("pydicom", "scipy")))
