@@ -10,7 +10,7 @@ import nibabel
 import numpy as np
 import pytest
 
-from palpate import processes as memory
+from palpate import processes
 from palpate.errors import ResourceError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
@@ -30,27 +30,27 @@ def group(tmp_path):
 
 
 def test_a_control_group_leaves_no_more_than_its_limit(group):
-    assert memory.available_memory(**group) == 5e8
-    assert memory.total_memory(**group) == 1e9
+    assert processes.available_memory(**group) == 5e8
+    assert processes.total_memory(**group) == 1e9
 
 
 def test_a_control_group_without_a_limit_leaves_what_the_machine_has(group, tmp_path):
     (tmp_path / "memory.max").write_text("max\n")
-    assert memory.available_memory(**group) == 2e6 * 1024.0
-    assert memory.total_memory(**group) == 4e6 * 1024.0
+    assert processes.available_memory(**group) == 2e6 * 1024.0
+    assert processes.total_memory(**group) == 4e6 * 1024.0
 
 
 def test_nothing_is_said_where_the_system_does_not_tell(tmp_path):
     nowhere = {"groups": (("/nowhere/limit", "/nowhere/use", "inactive_file"),), "machine": tmp_path / "none"}
-    assert memory.available_memory(**nowhere) is None
-    assert memory.total_memory(**nowhere) is None
+    assert processes.available_memory(**nowhere) is None
+    assert processes.total_memory(**nowhere) is None
 
 
 @pytest.mark.parametrize(("stated", "left"), [("0.25", 2.5e8), ("3", 5e8), ("-1", 5e8), ("much", 5e8), ("", 5e8)])
 def test_what_the_environment_states_is_a_limit_if_it_is_a_plain_number(group, environment, stated, left):
     environment(PALPATE_MEMORY_GB=stated)
-    assert memory.available_memory(**group) == left
-    assert memory.total_memory(**group) == (left if stated == "0.25" else 1e9)
+    assert processes.available_memory(**group) == left
+    assert processes.total_memory(**group) == (left if stated == "0.25" else 1e9)
 
 
 CASE = """

@@ -73,10 +73,8 @@ class Contacts:
 
         These (n, n_surfaces, 3) are along the box's faces where a node lies on one. All zero where it is not on it.
         """
-        values, gradients = (
-            np.zeros((len(nodes), len(self.level_sets))),
-            np.zeros((len(nodes), len(self.level_sets), 3)),
-        )
+        values = np.zeros((len(nodes), len(self.level_sets)))
+        gradients = np.zeros((*values.shape, 3))
         for k, phi in enumerate(self.level_sets):
             rows = np.flatnonzero(self.on[nodes, k])
             if len(rows):
