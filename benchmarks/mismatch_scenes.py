@@ -167,6 +167,13 @@ def _all(truth: Truth, seed: int) -> tuple[View, Facts]:
     return replace(view, off_mm=drawn.off_mm), facts | told
 
 
+def _everything(truth: Truth, seed: int) -> tuple[View, Facts]:
+    """All of that, and the rectum is drawn thinner, or thicker."""
+    (view, facts), (drawn, told) = _all(truth, seed), _driver(truth, seed)
+    off = {**(view.off_mm or {}), **(drawn.off_mm or {})}
+    return replace(view, off_mm=off), facts | told | {"off_mm": off}
+
+
 @dataclass(frozen=True)
 class Kind:
     """A kind of scene: the truth that it shows ("held", "border" or a key of PATCHES), and how."""
@@ -189,6 +196,7 @@ KINDS = {
     "field": Kind("field", _still, "a Gaussian field of ln E in the surroundings"),
     "field-organs": Kind("field-organs", _still, "Gaussian fields of ln E in surroundings and organs"),
     "sheath": Kind("sheath", _still, "a soft sheath round the prostate"),
+    "everything": Kind("everything", _everything, "fields in all tissues, a soft sheath, 'all' and 'driver'"),
 }
 
 
@@ -278,14 +286,14 @@ def _truth(name: str, seed: int, law: str, cache: Path) -> Truth:
     """A truth of a body, from the cache or solved; those of the linear law that differ in the border share a solve."""
     path = cache / "truths" / f"{name}-{seed}-{law}.npz"
     options = _options(seed, law)
-    raw = _mesh(options, cache, sheathed=name == "sheath")
+    raw = _mesh(options, cache, sheathed=name in SHEATHED)
     space = lagrange_space(_merged(raw), "P2")
     if not path.exists():
         border, told = _border(seed, space)
         asked, patches = {"held": (None, Facts()), "border": (border, told)}, None
         if name in PATCHES:
-            patches, told = PATCHES[name](raw, seed)
-            asked = {name: (None, told)}
+            patches, of_patches = PATCHES[name](raw, seed)
+            asked = {name: (border, told | of_patches) if name in MOVING else (None, of_patches)}
         elif law != "linear":
             asked = {name: asked[name]}
         found, filling = _solved(space, patches, [outside for outside, _ in asked.values()], options)
@@ -411,12 +419,20 @@ def _sheath(mesh: TetMesh, seed: int) -> tuple[Array, Facts]:
     return factors, {"sheath_mm": SHEATH_MM, "sheath_share": share}
 
 
+def _patchy(mesh: TetMesh, seed: int) -> tuple[Array, Facts]:
+    """The fields of all tissues, and the sheath beside them."""
+    (field, told), (sheath, of_sheath) = _field(mesh, seed, organs=True), _sheath(mesh, seed)
+    return field + sheath, told | of_sheath
+
+
 PATCHES: dict[str, Callable[[TetMesh, int], tuple[Array, Facts]]] = {
     "halves": _halves,
     "field": _field,
     "field-organs": partial(_field, organs=True),
     "sheath": _sheath,
+    "everything": _patchy,
 }
+SHEATHED, MOVING = ("sheath", "everything"), ("everything",)  # truths with that tissue; patchy ones whose border moves
 
 
 # ---- common parts ----------------------------------------------------------------------------------------------------

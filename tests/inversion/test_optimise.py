@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from palpate.inversion.optimise import RADIUS, Bounds, Outcome, gauss_newton, same_minimum
+from palpate.inversion.optimise import RADIUS, Bounds, Outcome, TrustRegion, gauss_newton, same_minimum
 
 WIDE = Bounds(np.full(2, -5.0), np.full(2, 5.0))
 
@@ -141,3 +143,31 @@ def test_the_start_is_not_written_into(toys, rng):
     start = np.full(5, 0.5)
     gauss_newton(toys.coupled(rng), start, bounds=WIDE)
     assert np.array_equal(start, np.full(5, 0.5))
+
+
+def test_a_direction_that_bends_twice_as_much_as_the_matrix_says_is_not_crossed_to_and_fro(toys, rng):
+    """The whole step leads as far beyond the minimum; the place between both slopes is the minimum along it."""
+    objective = toys.coupled(rng)
+    root = np.linalg.cholesky(objective.curvature)
+    along = np.array([0.0, 0.0, 0.6, 0.8, 0.0])
+    matrix = root @ (np.eye(5) - 0.495 * np.outer(along, along)) @ root.T
+
+    class Bent:
+        n_parameters = 2
+
+        def __call__(self, unknowns):
+            return replace(objective(unknowns), matrix=matrix)
+
+    found = gauss_newton(Bent(), np.full(5, 2.0), bounds=WIDE, tolerance=1e-9)
+    assert found.outcome is Outcome.CONVERGED
+    assert len(found.history) < 12
+    assert found.unknowns == pytest.approx(objective.centre, abs=1e-3)
+
+
+def test_a_step_that_other_unknowns_make_too_long_does_not_shorten_those_of_the_log_moduli():
+    """It is damped, which passes; a radius would stay as short as the log-moduli's part of it was."""
+    refused = TrustRegion().smaller(1e-4)
+    assert refused.radius == TrustRegion().radius
+    assert refused.damping > 0.0
+    assert refused.after(1.0, 1e-4).damping == 0.0
+    assert TrustRegion().smaller(0.5).radius == 0.25

@@ -250,6 +250,27 @@ def test_the_image_around_the_surfaces_errs_there_as_the_whole_one(twins, twin, 
     assert np.std(near) > 0.01
 
 
+def test_where_an_image_ends_a_grid_that_lies_elsewhere_tells_of_no_error(twins, twin, imaged):
+    """Images that end within the organs: a surface that is cut there errs no more than where it is whole."""
+    objective, evaluation = imaged
+    whole, size = fitted(twins, twin, 1.5), np.array([16.0, 44.0, 44.0])
+    grid = twins.centred_grid(tuple(size), (1.5,) * 3)
+    cut = replace(whole, before=grid, after=grid)
+    places = np.concatenate([line.residuals.places for line in evaluation.linearisations])
+    ends = np.abs(grid.index(places) - 0.5 * (np.array(grid.shape) - 1)) - 0.5 * (np.array(grid.shape) - 1)
+    draws = range(4)
+    found = {
+        name: np.stack(
+            [np.concatenate(imaging_errors(objective, evaluation, (s,), rng=np.random.default_rng(k))) for k in draws]
+        )
+        for name, s in (("whole", whole), ("cut", cut))
+    }
+    beyond = (ends > 0.0).any(axis=1)
+    assert np.count_nonzero(beyond) > 50
+    assert not found["cut"][:, beyond].any()
+    assert np.abs(found["cut"]).max() < 1.5 * np.abs(found["whole"]).max()
+
+
 def test_later_states_of_one_rest_state_have_the_same_image_of_it(twins, twin, imaged):
     """Two states that are alike err alike in what their rest states show, where that is one, and else not."""
     objective, evaluation = imaged

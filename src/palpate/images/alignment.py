@@ -317,10 +317,13 @@ def _state(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
     return _State(motion, residual, np.hstack([np.cross(places - centre, slope), slope]), area * inside, centre, radius)
 
 
-def within_border(grid: VoxelGrid, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of points (n, 3) in RAS mm lie so far inside a grid that a map on it is measured there, not continued."""
+def within_border(grid: VoxelGrid, points: NDArray[np.float64], voxels: float = BORDER_VOXELS) -> NDArray[np.bool_]:
+    """Which of points (n, 3) in RAS mm lie so many voxels inside a grid.
+
+    By default so far that a map on it is measured there, not continued.
+    """
     index = grid.index(points)
-    return np.asarray(((index >= BORDER_VOXELS) & (index <= np.array(grid.shape) - 1.0 - BORDER_VOXELS)).all(axis=1))
+    return np.asarray(((index >= voxels) & (index <= np.array(grid.shape) - 1.0 - voxels)).all(axis=1))
 
 
 def _scale(state: _State) -> float:

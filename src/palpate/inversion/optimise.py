@@ -98,14 +98,16 @@ class TrustRegion:
         """After a step that was refused, whose `longest` log-modulus is known.
 
         It is damped only where no log-modulus is left to be shortened: damping all unknowns ends a step along a valley.
+        A radius that such steps shortened would stay so: it grows no more where the others are what was too long.
         """
-        damping = self.damping if longest > SAME_MINIMUM else max(4.0 * self.damping, LEAST_DAMPING)
-        return TrustRegion(0.5 * min(self.radius, longest), damping)
+        if longest > SAME_MINIMUM:
+            return TrustRegion(0.5 * min(self.radius, longest), self.damping)
+        return TrustRegion(self.radius, max(4.0 * self.damping, LEAST_DAMPING))
 
     def after(self, share: float, longest: float, *, grows: bool = True) -> TrustRegion:
         """After a step that was taken, which brought a `share` of what it promised."""
         damping = self.damping / 4.0 if self.damping > LEAST_DAMPING else 0.0
-        if share < BAD:
+        if share < BAD and longest > SAME_MINIMUM:
             return TrustRegion(0.5 * min(self.radius, longest), damping)
         return TrustRegion(min(2.0 * self.radius, RADIUS) if share > 1.0 - BAD and grows else self.radius, damping)
 
@@ -187,24 +189,33 @@ def _search(
     bounds: Bounds,
     region: TrustRegion,
 ) -> tuple[tuple[NDArray[np.float64], Evaluation, TrustRegion] | None, int, bool]:
-    """First step that reduces the objective, with the next region, or None; the trials; whether any was solved."""
+    """First step that reduces the objective, with the next region, or None; the trials; whether any was solved.
+
+    A step d that brings too little, for the objective bends more along it than its matrix says, ends where the slopes
+    s.d at its ends have their secant's root, if that is lower.
+    """
     n, solved = objective.n_parameters, False
-    for trials in range(TRIALS):
+    for trials in range(1, TRIALS + 1):
         quadratic = _QuadraticModel.of(now, undamped.free, n, damping=region.damping) if region.damping else undamped
         trial = unknowns + quadratic.step(region.radius)
         trial[:n] = np.clip(trial[:n], bounds.lower, bounds.upper)
         step = trial - unknowns
         longest = float(np.abs(step[:n]).max(initial=0.0))
-        promised = -now.score @ step - 0.5 * step @ now.matrix @ step
+        slope = float(now.score @ step)
+        promised = -slope - 0.5 * step @ now.matrix @ step
         try:
             there = objective(trial)
+            solved, gain, rises = True, now.value - there.value, float(there.score @ step)
+            if promised > 0.0 and gain < BAD * promised and slope < 0.0 < rises:
+                nearer = unknowns + slope / (slope - rises) * step
+                between = objective(nearer)
+                if between.value < min(now.value, there.value):
+                    return (nearer, between, region), trials + 1, True
         except SolverError:  # no law answers where elements are turned inside out
             region = region.smaller(longest)
             continue
-        solved = True
-        gain = now.value - there.value
         if promised > 0.0 and gain > 1e-4 * promised:  # what a bound leaves of a step may lead uphill
-            return (trial, there, region.after(float(gain / promised), longest)), trials + 1, True
+            return (trial, there, region.after(float(gain / promised), longest)), trials, True
         region = region.smaller(longest)
     return None, TRIALS, solved
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import EstimationError
+from palpate.images.alignment import within_border
 from palpate.images.checks import later_names
 from palpate.images.distance import DistanceMap, tissue_distance_map
 from palpate.images.segmentation import Segmentation
@@ -181,7 +182,8 @@ class SurfaceDistance:
         """Errors (n,) mm of the residuals when the fitted model itself is imaged.
 
         Both directions of the distance see the same error and have half the weight each: that of the direction model ->
-        image counts twice, and the other one not.
+        image counts twice, and the other one not. Within a voxel of an image's border there is none: what a grid that
+        lies elsewhere shows there ends elsewhere, as no pair of images does.
         """
         target, surface = self.target, self.target.surface
         if target.voxels is None:
@@ -196,7 +198,9 @@ class SurfaceDistance:
             for image in (before, after)
         ]
         errors, n = np.zeros(len(residuals.values)), len(rest)
-        errors[:n] = 2.0 * (maps[1].at(residuals.places[:n]) - maps[0].at(rest) - excess)
+        places = residuals.places[:n]
+        shown = within_border(before.grid, rest, 1.0) & within_border(after.grid, places, 1.0)
+        errors[:n] = np.where(shown, 2.0 * (maps[1].at(places) - maps[0].at(rest) - excess), 0.0)
         return errors
 
     def growth_error(self, residuals: Residuals, tissue: str, peers: Sequence[Observation]) -> NDArray[np.float64]:
