@@ -17,7 +17,7 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
 from palpate.study.samples import draw_moduli
 from palpate.study.together import StatedPosterior
-from palpate.study.verdicts import hull, verdict
+from palpate.study.verdicts import estimates_of, hull, intervals_of, verdict
 from palpate.uncertainty import (
     FittedState,
     grid_position_shifts,
@@ -434,3 +434,25 @@ def test_the_hull_holds_every_interval_and_an_open_end_stays_open():
     assert hull([(2.0, 4.0), (1.0, 3.0)]) == (1.0, 4.0)
     assert hull([(2.0, 4.0), (None, 3.0)]) == (None, 4.0)
     assert hull([(2.0, None)]) == (2.0, None)
+
+
+def test_an_interval_that_could_not_be_followed_says_so_and_blames_no_bound(inversion, settings, estimation):
+    minimum, covariance = inversion.minimum, estimation.covariance
+    frozen = frozen_posterior(inversion.objective, minimum.unknowns, minimum.evaluation)
+
+    class Uphill:
+        n_parameters = frozen.n_parameters
+
+        def __call__(self, unknowns):
+            there = frozen(unknowns)
+            return replace(there, score=-100.0 * there.score)
+
+    away = replace(minimum, unknowns=minimum.unknowns + 0.1)
+    posteriors = [StatedPosterior(frozen, minimum, covariance.total)]
+    assert all(of.followed for of in intervals_of(inversion, settings, posteriors))
+    known = intervals_of(inversion, settings, [*posteriors, StatedPosterior(Uphill(), away, covariance.total)])
+    for found in estimates_of(inversion, known, covariance, truth={}):
+        assert found.verdict == "not identified"
+        assert found.interval95 is None
+        assert "could not be followed" in found.why
+        assert "bounds" not in found.why

@@ -17,6 +17,7 @@ from palpate.uncertainty import NORMAL_95, Covariance, Interval, ModulusInterval
 from palpate.unknowns import KNOWN_MODULUS, ratio_of_eta
 
 IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
+NOT_FOLLOWED = "the 95 % interval is open: it could not be followed from a minimum"
 
 
 def hull(intervals: Sequence[Interval]) -> Interval:
@@ -50,11 +51,15 @@ def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str,
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """Of one parameter: its own interval, one that holds all minima that fit as well, both of e^theta; at a bound."""
+    """Of one parameter: its own interval, one that holds all minima that fit as well, both of e^theta; at a bound.
+
+    followed: whether every posterior's minimum was reached, from which its profile is taken.
+    """
 
     own: ModulusInterval
     interval: Interval
     at_bound: bool
+    followed: bool
 
 
 def intervals_of(
@@ -83,7 +88,8 @@ def intervals_of(
         good = [c.minimum.unknowns for c in minima if as_good(c.value, best.value, scale=float(scales[i]))]
         ellipses = (log_interval(float(np.exp(x[i])), sd, **limits) for x in good)
         whole = hull([own.ends, *ellipses, *(of.ends for of in wider)])
-        found.append(Known(own, whole, bool(at_bound[i])))
+        followed = all(len(of.profile.theta) > 1 for of in (own, *wider))
+        found.append(Known(own, whole, bool(at_bound[i]), followed))
     return tuple(found)
 
 
@@ -122,6 +128,7 @@ def estimates_of(
         of_scale = float(np.sqrt(shares.get(KNOWN_MODULUS, 0.0) * covariance.total[i, i]))
         by_ratio = _without(of_scale, of.interval, value, centre=float(np.exp(theta - shift)))
         word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
+        why = why if of.followed or of.at_bound else NOT_FOLLOWED
         if word != "identified" and of_scale > 0.0:
             # the ratio may say more than a modulus whose scale is known within a range alone
             ratio_word, ratio_why = verdict(by_ratio, at_bound=of.at_bound, absolute=True)
