@@ -80,7 +80,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--noise", default="clean,0.3", help="standard deviations of the surfaces, mm")
     parser.add_argument("--bodies", type=int, default=6)
     parser.add_argument("--first-seed", type=int, default=701)
-    parser.add_argument("--share", default="0/1", help="k/n: every n-th seed from the k-th, to run n at once")
+    parser.add_argument(
+        "--share", default="0/1", help="k/n, k from 0 to n - 1: every n-th seed from the k-th, to run n at once"
+    )
     parser.add_argument("--scenes-cache", type=Path, help="folder of truths and scenes, read and added to")
     parser.add_argument("--output", type=Path, default=Path("mismatch.jsonl"))
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the case; repeatable")
@@ -100,6 +102,8 @@ def _arguments() -> argparse.Namespace:
 def _keys(arguments: argparse.Namespace) -> list[SceneKey]:
     """The scenes that were asked for, body after body: scenes of one body share their truths."""
     number, of = (int(part) for part in arguments.share.split("/"))
+    if not 0 <= number < of:
+        raise SystemExit(f"--share {arguments.share}: the first number must be 0 to {of - 1}, or seeds are left out")
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.bodies)[number::of]
     noises = [0.0 if part == "clean" else float(part) for part in arguments.noise.split(",")]
     return [
