@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import palpate
@@ -18,6 +19,12 @@ def test_results_come_in_the_order_of_the_items():
 def test_what_a_call_raises_is_raised():
     with pytest.raises(ZeroDivisionError):
         mapped(lambda n: 1 // n, [2, 1, 0])
+
+
+def test_what_numpy_is_told_to_let_pass_passes_in_every_thread(environment):
+    environment(OMP_NUM_THREADS="2")
+    with np.errstate(invalid="ignore"):
+        assert np.isnan(mapped(np.log, [-1.0, -2.0, -3.0])).all()
 
 
 def test_the_limit_of_the_linear_algebra_holds(environment):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from typing import TypeVar
 
 from multifrontal import blas_on_one_thread, processors
@@ -22,9 +23,10 @@ Result = TypeVar("Result")
 def mapped(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """Results of `function` for each item, in their order, by as many threads as there are `processors`.
 
-    The first exception that a call raises is raised.
+    A thread works in the caller's context: what NumPy is told to let pass there is let pass in it. The first exception
+    that a call raises is raised.
     """
     if processors() == 1:
         return [function(item) for item in items]
     with ThreadPoolExecutor(max_workers=processors()) as pool:
-        return list(pool.map(function, items))
+        return list(pool.map(lambda item: item[0].run(function, item[1]), [(copy_context(), item) for item in items]))
