@@ -286,14 +286,15 @@ def _truth(name: str, seed: int, law: str, cache: Path) -> Truth:
     """A truth of a body, from the cache or solved; those of the linear law that differ in the border share a solve."""
     path = cache / "truths" / f"{name}-{seed}-{law}.npz"
     options = _options(seed, law)
-    raw = _mesh(options, cache, sheathed=name in SHEATHED)
+    patchy = PATCHES.get(name)
+    raw = _mesh(options, cache, sheathed=patchy is not None and patchy.sheathed)
     space = lagrange_space(_merged(raw), "P2")
     if not path.exists():
         border, told = _border(seed, space)
         asked, patches = {"held": (None, Facts()), "border": (border, told)}, None
-        if name in PATCHES:
-            patches, of_patches = PATCHES[name](raw, seed)
-            asked = {name: (border, told | of_patches) if name in MOVING else (None, of_patches)}
+        if patchy is not None:
+            patches, of_patches = patchy.factors(raw, seed)
+            asked = {name: (border, told | of_patches) if patchy.moving else (None, of_patches)}
         elif law != "linear":
             asked = {name: asked[name]}
         found, filling = _solved(space, patches, [outside for outside, _ in asked.values()], options)
@@ -425,14 +426,22 @@ def _patchy(mesh: TetMesh, seed: int) -> tuple[Array, Facts]:
     return field + sheath, told | of_sheath
 
 
-PATCHES: dict[str, Callable[[TetMesh, int], tuple[Array, Facts]]] = {
-    "halves": _halves,
-    "field": _field,
-    "field-organs": partial(_field, organs=True),
-    "sheath": _sheath,
-    "everything": _patchy,
+@dataclass(frozen=True)
+class Patches:
+    """A truth whose tissues are not homogeneous: factors of E (n_tets,), in ln, a sheath, a moving border."""
+
+    factors: Callable[[TetMesh, int], tuple[Array, Facts]]
+    sheathed: bool = False
+    moving: bool = False
+
+
+PATCHES = {
+    "halves": Patches(_halves),
+    "field": Patches(_field),
+    "field-organs": Patches(partial(_field, organs=True)),
+    "sheath": Patches(_sheath, sheathed=True),
+    "everything": Patches(_patchy, sheathed=True, moving=True),
 }
-SHEATHED, MOVING = ("sheath", "everything"), ("everything",)  # truths with that tissue; patchy ones whose border moves
 
 
 # ---- common parts ----------------------------------------------------------------------------------------------------

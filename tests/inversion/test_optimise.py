@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.errors import SolverError
 from palpate.inversion.optimise import RADIUS, Bounds, Outcome, TrustRegion, gauss_newton, same_minimum
 
 WIDE = Bounds(np.full(2, -5.0), np.full(2, 5.0))
@@ -162,6 +163,23 @@ def test_a_direction_that_bends_twice_as_much_as_the_matrix_says_is_not_crossed_
     assert found.outcome is Outcome.CONVERGED
     assert len(found.history) < 12
     assert found.unknowns == pytest.approx(objective.centre, abs=1e-3)
+
+
+def test_a_step_is_taken_whole_where_the_place_between_both_slopes_cannot_be_solved(toys, rng):
+    objective = toys.coupled(rng)
+
+    class Hollow:
+        n_parameters = 2
+
+        def __call__(self, unknowns):
+            there = objective(unknowns)
+            if there.value < 1e-9:
+                raise SolverError("the motion turns elements inside out")
+            return replace(there, matrix=there.matrix / 1.9)
+
+    away = np.array([0.2, -0.3, 0.1, 0.4, -0.2])
+    found = gauss_newton(Hollow(), objective.centre + away, bounds=WIDE, max_steps=2)
+    assert found.history[1].theta == pytest.approx((objective.centre - 0.9 * away)[:2], abs=1e-9)
 
 
 def test_a_step_that_other_unknowns_make_too_long_does_not_shorten_those_of_the_log_moduli():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Protocol
@@ -189,13 +190,13 @@ def _search(
     bounds: Bounds,
     region: TrustRegion,
 ) -> tuple[tuple[NDArray[np.float64], Evaluation, TrustRegion] | None, int, bool]:
-    """First step that reduces the objective, with the next region, or None; the trials; whether any was solved.
+    """First step that reduces the objective, with the next region, or None; evaluations; whether any was solved.
 
     A step d that brings too little, for the objective bends more along it than its matrix says, ends where the slopes
     s.d at its ends have their secant's root, if that is lower.
     """
-    n, solved = objective.n_parameters, False
-    for trials in range(1, TRIALS + 1):
+    n, solved, spent = objective.n_parameters, False, 0
+    for _ in range(TRIALS):
         quadratic = _QuadraticModel.of(now, undamped.free, n, damping=region.damping) if region.damping else undamped
         trial = unknowns + quadratic.step(region.radius)
         trial[:n] = np.clip(trial[:n], bounds.lower, bounds.upper)
@@ -203,21 +204,23 @@ def _search(
         longest = float(np.abs(step[:n]).max(initial=0.0))
         slope = float(now.score @ step)
         promised = -slope - 0.5 * step @ now.matrix @ step
+        spent += 1
         try:
             there = objective(trial)
-            solved, gain, rises = True, now.value - there.value, float(there.score @ step)
-            if promised > 0.0 and gain < BAD * promised and slope < 0.0 < rises:
-                nearer = unknowns + slope / (slope - rises) * step
-                between = objective(nearer)
-                if between.value < min(now.value, there.value):
-                    return (nearer, between, region), trials + 1, True
         except SolverError:  # no law answers where elements are turned inside out
             region = region.smaller(longest)
             continue
+        solved, gain, rises = True, now.value - there.value, float(there.score @ step)
+        if promised > 0.0 and gain < BAD * promised and slope < 0.0 < rises:
+            nearer, spent = unknowns + slope / (slope - rises) * step, spent + 1
+            with suppress(SolverError):
+                between = objective(nearer)
+                if between.value < min(now.value, there.value):
+                    return (nearer, between, region), spent, True
         if promised > 0.0 and gain > 1e-4 * promised:  # what a bound leaves of a step may lead uphill
-            return (trial, there, region.after(float(gain / promised), longest)), trials, True
+            return (trial, there, region.after(float(gain / promised), longest)), spent, True
         region = region.smaller(longest)
-    return None, TRIALS, solved
+    return None, spent, solved
 
 
 def newton_decrement(now: Evaluation) -> float:

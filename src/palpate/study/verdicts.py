@@ -53,7 +53,7 @@ def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str,
 class Known:
     """Of one parameter: its own interval, one that holds all minima that fit as well, both of e^theta; at a bound.
 
-    followed: whether every posterior's minimum was reached, from which its profile is taken.
+    followed: whether each posterior's profile could be followed from its minimum.
     """
 
     own: ModulusInterval
