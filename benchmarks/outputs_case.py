@@ -141,7 +141,8 @@ def state(
     if here == contents(bench.old(command)):
         return "old"
     wanted = {name: digest for name, digest in contents(bench.new(command)).items() if name not in left_out}
-    loose = {"result.json", "mesh.json", *((*UNSETTLED, "model.npz") if command == "estimate" else ())}  # times, a seal
+    loose = {"result.json", "mesh.json", "preview.html"}  # times
+    loose |= {*UNSETTLED, "model.npz"} if command == "estimate" else set()  # and a seal
     if {n: d for n, d in here.items() if n not in loose} != {n: d for n, d in wanted.items() if n not in loose}:
         return "mixed"
     return "new" if here.keys() == wanted.keys() and _sound(bench.new(command), folder) else "mixed"

@@ -170,7 +170,8 @@ def attempt(bench: Bench, command: str, folder: Path, disk: Disk) -> dict[str, A
         told.seek(0)
         text, (operations, written, refused) = err.read().decode(), json.loads(told.read())
     recovered(folder)
-    left_out = UNSETTLED if "report.html" in missing(bench, command, folder) else ()
+    gone = missing(bench, command, folder)
+    left_out = UNSETTLED if "report.html" in gone else ("preview.html",) if gone == {"preview.html"} else ()
     seen = {"state": state(bench, command, folder, left_out=left_out), "code": code, "page": not left_out}
     seen |= {"operations": operations, "written": written, "refused": refused}
     flaw = flaw_of(command, folder, seen, text)
@@ -188,6 +189,9 @@ def flaw_of(command: str, folder: Path, seen: dict[str, Any], text: str) -> str:
     if "Traceback" in text or "bug" in text or seen["code"] not in (0, 6):
         return f"ended with {seen['code']}: {text[-600:]}"
     completed = seen["code"] == 6 and "completes them" in text and seen["state"] == "new"  # by the next run
+    if command == "init" and not seen["page"] and seen["state"] == "new":
+        said = seen["code"] == 6 and "case.toml is written, but not what shows it" in text and len(lines) == 1
+        return "" if said else f"code {seen['code']}, the preview is missing without a word: {text[-600:]}"
     if seen["state"] == "mixed" or ((seen["state"] == "new") != (seen["code"] == 0) and not completed):
         return f"code {seen['code']}, but the folder is {seen['state']}: {text[-600:]}"
     if seen["code"] == 6 and len(lines) != 1:

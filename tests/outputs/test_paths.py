@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 
 from palpate.cli import main
+from palpate.errors import ResourceError
 from palpate.export.case_files import file_name
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
+from palpate.steps.previewing import new_case_with_page
 from palpate.study import run
 from palpate.study.case_file import read_case
+from palpate.study.outputs import OutputFolder, staged
 from palpate.study.result import MeshResult
 
 
@@ -94,6 +97,36 @@ def test_a_case_file_that_is_none_is_not_replaced(images, tmp_path, capsys, kind
     assert main(["init", *images, "--output", "out", "--quiet"]) == 6
     assert "out/case.toml is no regular file" in sentence(capsys)
     assert not (tmp_path / "mine").exists()
+
+
+@pytest.mark.parametrize("kind", ["file", "pipe"])
+def test_where_a_sub_folder_is_none_nothing_changes(tmp_path, kind):
+    (tmp_path / "notes.txt").write_text("an earlier run's")
+    {"file": Path.touch, "pipe": os.mkfifo}[kind](tmp_path / "surfaces")
+    with staged(tmp_path) as staging:
+        (staging.area / "surfaces").mkdir()
+        (staging.area / "surfaces" / "bladder.stl").write_text("new")
+        (staging.area / "notes.txt").write_text("new")
+        with pytest.raises(ResourceError, match="surfaces is no folder"):
+            staging.commit()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["notes.txt", "surfaces"]
+    assert (tmp_path / "notes.txt").read_text() == "an earlier run's"
+
+
+class FullAfterTheCase(OutputFolder):
+    """A folder on a disk that has room for one file."""
+
+    def staged(self):
+        if self.written:
+            raise ResourceError("no space left")
+        return super().staged()
+
+
+def test_a_case_without_room_for_its_preview_stands_and_says_so(images, tmp_path):
+    files = [tmp_path / name for name in images]
+    with pytest.raises(ResourceError, match=r"case\.toml is written, but not what shows it: no space left"):
+        new_case_with_page(files, None, FullAfterTheCase(tmp_path / "out"))
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["case.toml"]
 
 
 @pytest.mark.parametrize("letter", ["a", "ä", "前", "𝒜", "/", "\udc80"])

@@ -8,7 +8,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from palpate.errors import ConfigurationError, InputDataError, PalpateError
+from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
 from palpate.images.tissue import Role
 from palpate.progress import Progress, silent
 from palpate.report.preview import GENERATOR, preview_page
@@ -63,7 +63,7 @@ def new_case_with_page(
 ) -> NewCase:
     """Write case.toml for label images as `write_new_case` does, and beside it its preview.
 
-    The case stands without one where none can be made.
+    The case stands without one where none can be made; raises `ResourceError` where the disk refuses it.
     """
     refuse_other_page(outputs.path / PREVIEW)
     new = write_new_case(images, table, outputs, cts=cts)
@@ -83,7 +83,10 @@ def new_case_with_page(
     except Exception:  # a drawing never costs the case
         LOGGER.exception("the preview could not be drawn")
     else:
-        _put(page, outputs, PREVIEW)
+        try:
+            _put(page, outputs, PREVIEW)
+        except ResourceError as error:
+            raise ResourceError(f"{new.path} is written, but not what shows it: {error}") from error
     return new
 
 

@@ -362,13 +362,18 @@ def _refuse_improper(folder: Path, names: Iterable[str]) -> None:
     """Raise `ResourceError` where something that no file can replace has a name that is to be written in `folder`.
 
     A file may be replaced; a folder, a link, a pipe, a device or a file protected by the system may not, nor may a
-    sub-folder be reached through a link.
+    sub-folder be reached through a link or be something else.
     """
     for name in names:
         path = folder / name
         try:
             if not is_inside(folder, name):
                 raise ResourceError(f"{path} leads out of the folder through a link: remove the link")
+            if path.parent.exists() and not path.parent.is_dir():
+                raise ResourceError(
+                    f"{path.parent} is no folder, so the new {path.name} cannot lie there: remove it, or choose another"
+                    " --output folder"
+                )
             if not os.path.lexists(path):
                 continue
             if not stat.S_ISREG(path.lstat().st_mode):
