@@ -191,7 +191,7 @@ def flaw_of(command: str, folder: Path, seen: dict[str, Any], text: str) -> str:
     completed = seen["code"] == 6 and "completes them" in text and seen["state"] == "new"  # by the next run
     if command == "init" and not seen["page"] and seen["state"] == "new":
         said = seen["code"] == 6 and "case.toml is written, but not what shows it" in text and len(lines) == 1
-        return "" if said else f"code {seen['code']}, the preview is missing without a word: {text[-600:]}"
+        return "" if said or completed else f"code {seen['code']}, the preview is missing without a word: {text[-600:]}"
     if seen["state"] == "mixed" or ((seen["state"] == "new") != (seen["code"] == 0) and not completed):
         return f"code {seen['code']}, but the folder is {seen['state']}: {text[-600:]}"
     if seen["code"] == 6 and len(lines) != 1:

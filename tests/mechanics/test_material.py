@@ -157,7 +157,8 @@ def test_a_reduced_basis_tells_what_its_responses_to_the_material_miss_elsewhere
     there = LinearisationPoint(moduli, np.concatenate([boundary, material]))
     homogeneous = LinearisationPoint(moduli, np.concatenate([boundary, 0.0 * material]))
     first = reduced_basis(model, MODULI)
-    first = first.with_material(first.system.material_responses(model.solve(MODULI, homogeneous.coefficients).values))
+    responses = first.system.material_responses(model.solve(MODULI, homogeneous.coefficients).values)
+    first = first.with_material(responses, MODULI)
     basis = first.update(homogeneous)
     missing = model.solve(moduli, there.coefficients).values - basis.model.solve(moduli, there.coefficients).values
     assert basis.error(homogeneous).relative < 1e-5
@@ -168,7 +169,7 @@ def test_an_updated_reduced_basis_misses_nothing_of_what_follows_the_material(bo
     """Where it was updated: the material's coefficients there are no combination of the directions that decide."""
     model, every = linear_model(*body, material=modes), np.concatenate(coefficients)
     first = reduced_basis(model, MODULI)
-    first = first.with_material(first.system.material_responses(model.solve(MODULI, every).values))
+    first = first.with_material(first.system.material_responses(model.solve(MODULI, every).values), MODULI)
     n = model.n_regions + len(every)
     directions = rng.normal(size=(n, 2))
     at = LinearisationPoint(MODULI * [1.2, 1.0], every, directions, np.eye(n))

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from palpate.approximation.contract import LinearisationPoint, ModelError, determined
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem, weighted_sum
 from palpate.mechanics.reduced import Projection, ReducedModel, projection
-from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
-from palpate.mechanics.solvers.contract import Factorisation
+from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients, times
+from palpate.mechanics.solvers.contract import AT_ONCE, Factorisation
 from palpate.mechanics.solvers.registry import SOLVERS, CheckedFactorisation
 from palpate.mesh.space import Constraint
 
@@ -80,8 +81,8 @@ class ReducedBasis:
         model, near, sharper = self.full_model, self.system, self
         direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
         ratios, stale = at.moduli / near.moduli, at.directions is not None and self._stale(at.moduli)
-        # solutions that iterate themselves help none; many right-hand sides are worth a factorisation of their own
-        if stale or not direct or ratios.max() >= FAR * ratios.min():
+        # solutions that iterate themselves help none
+        if not direct or ratios.max() >= FAR * ratios.min():
             near = model.system(at.moduli)
             sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=1))
         matrix = weighted_sum(at.moduli, model.free_stiffness)
@@ -111,10 +112,8 @@ class ReducedBasis:
             displacement = displacement + late.sum(axis=1)
             sharper = replace(_extended(sharper, missing, cost), place=at)
         if stale:
-            responses = sharper.system.material_responses(displacement, tolerance=TANGENT)
-            counts = sharper.counts + SolveCounts(tangent=model.material.n_modes)
-            return replace(sharper, counts=counts).with_material(responses)
-        return _with_sharper_material(sharper, at, displacement, solved)
+            return _with_all_material(sharper, at, displacement, matrix, solved)
+        return _with_sharper_material(sharper, at, displacement, matrix, solved)
 
     @property
     def error_counts(self) -> SolveCounts:
@@ -136,9 +135,9 @@ class ReducedBasis:
             *self.system.error_bound(at.moduli, homogeneous, np.asarray(model.constraint.free.T @ forces))
         )
 
-    def with_material(self, responses: NDArray[np.float64]) -> ReducedBasis:
-        """With the responses (n_dof, n_material) mm to the material modes at the factorised moduli."""
-        return replace(self, projection=self.projection.with_material(responses), material_at=self.system.moduli)
+    def with_material(self, responses: NDArray[np.float64], moduli: NDArray[np.float64]) -> ReducedBasis:
+        """With the responses (n_dof, n_material) mm to the material modes at moduli (n_regions,) kPa."""
+        return replace(self, projection=self.projection.with_material(responses), material_at=moduli)
 
     def _stale(self, moduli: NDArray[np.float64]) -> bool:
         """Whether responses to the material modes are not there yet, or of far from moduli (n_regions,) kPa."""
@@ -199,10 +198,36 @@ def basis_of(system: LinearSystem, responses: NDArray[np.float64], counts: Solve
     return ReducedBasis(projection(system.model, snapshots), system, counts)
 
 
+def _with_all_material(
+    basis: ReducedBasis,
+    at: LinearisationPoint,
+    displacement: NDArray[np.float64],
+    matrix: sparse.csr_matrix[np.float64],
+    solved: Callable[[NDArray[np.float64], float], NDArray[np.float64]],
+) -> ReducedBasis:
+    """All responses to the material modes made exact at a place, from what they are elsewhere.
+
+    matrix (n_free, n_free): the stiffness there, as in what follows.
+    """
+    model, free, n = basis.full_model, basis.constraint.free, basis.full_model.material.n_modes
+    responses, by_material = np.zeros((len(displacement), n)), model.by_material(at.moduli, displacement)
+    for start in range(0, n, AT_ONCE):
+        some = slice(start, start + AT_ONCE)
+        loads = -np.asarray(free.T @ by_material.along(np.eye(n)[:, some]))
+        if len(basis.material_at):
+            known = np.asarray(free.T @ basis.model.output_material[:, some])
+            found = known + solved(loads - times(matrix, known), TANGENT)
+        else:
+            found = solved(loads, TANGENT)
+        responses[:, some] = np.asarray(free @ found)
+    return replace(basis, counts=basis.counts + SolveCounts(tangent=n)).with_material(responses, at.moduli)
+
+
 def _with_sharper_material(
     basis: ReducedBasis,
     at: LinearisationPoint,
     displacement: NDArray[np.float64],
+    matrix: sparse.csr_matrix[np.float64],
     solved: Callable[[NDArray[np.float64], float], NDArray[np.float64]],
 ) -> ReducedBasis:
     """The responses U to the material modes made exact at a place along its directions D of these coefficients.
@@ -219,7 +244,7 @@ def _with_sharper_material(
     free, before = model.constraint.free, basis.model.output_material
     loads = -np.asarray(free.T @ model.material_forces(at.moduli, displacement, along))
     known = np.asarray(free.T @ (before @ along))
-    lacking = loads - weighted_sum(at.moduli, model.free_stiffness) @ known
+    lacking = loads - times(matrix, known)
     change = np.asarray(free @ solved(lacking, TANGENT))
     with determined():
         share = np.linalg.pinv(along.T @ metric @ along, hermitian=True) @ (along.T @ metric)

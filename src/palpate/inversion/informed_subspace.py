@@ -123,7 +123,8 @@ class _Responses:
         responses = np.asarray(self.boundary @ every, dtype=np.float64)
         cost = self.system.response_counts + SolveCounts(tangent=self.material.shape[1])
         basis = basis_of(replace(self.system, model=model), responses, cost)
-        return basis.with_material(np.asarray(self.material @ material.astype(np.float32), dtype=np.float64))
+        responses = np.asarray(self.material @ material.astype(np.float32), dtype=np.float64)
+        return basis.with_material(responses, self.system.moduli)
 
 
 def informed_combinations(

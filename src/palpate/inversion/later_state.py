@@ -54,7 +54,10 @@ class LaterState:
 
     def combined(self, boundary: NDArray[np.float64], fields: NDArray[np.float64]) -> LaterState:
         """The same state with models on combinations of boundary modes (n_boundary, k) and of fields (n_fields, l)."""
-        constraint = replace(self.model.constraint, modes=self.model.constraint.modes @ boundary)
+        modes, moved = self.model.constraint.modes, np.flatnonzero(self.model.constraint.modes.any(axis=1))
+        combined = np.zeros((len(modes), boundary.shape[1]))
+        combined[moved] = modes[moved] @ boundary
+        constraint = replace(self.model.constraint, modes=combined)
         material = self.model.material.combined(fields)
         conditions = replace(self.model.conditions, constraint=constraint)
         finite = self.finite_strain and replace(self.finite_strain.under(conditions), material=material)
