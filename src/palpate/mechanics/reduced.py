@@ -19,7 +19,6 @@ from palpate.mechanics.solvers.conjugate_gradients import column_norms, times
 
 RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
 WELL_CONDITIONED = 1e-12  # of the Gram matrix' largest eigenvalue: above it Cholesky's factor orthogonalises safely
-NEARLY_ORTHOGONAL = 1e-6  # of the same, above which one pass leaves them orthogonal to 1e-10
 CHUNK = 64  # basis vectors multiplied with a stiffness at once
 ROWS = 4096  # of them, made orthogonal at once
 
@@ -258,8 +257,8 @@ def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
     """Orthonormal columns (n, m) that span the snapshots (n, k), each first scaled to length 1.
 
     Directions below 1e-10 of the largest singular value are dropped; raises `ConfigurationError` when none is left.
-    Cholesky factors of the Gram matrix, taken twice where it is not as well conditioned as it may be (Yamamoto et al.,
-    Electron. Trans. Numer. Anal. 44 (2015) 306-326), else Householder's QR.
+    Cholesky factors of the Gram matrix, taken twice, where it is well conditioned (Yamamoto et al., Electron. Trans.
+    Numer. Anal. 44 (2015) 306-326), else Householder's QR.
     """
     lengths = column_norms(snapshots) if snapshots.ndim == 2 else np.zeros(1)
     if snapshots.ndim != 2 or not np.all(np.isfinite(lengths)) or not np.any(lengths > 0.0):
@@ -269,9 +268,9 @@ def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
     gram = scaled.T @ scaled
     sizes = np.linalg.eigvalsh(gram)
     if sizes[0] > WELL_CONDITIONED * sizes[-1]:
-        for number in range(1 if sizes[0] > NEARLY_ORTHOGONAL * sizes[-1] else 2):
+        for again in (False, True):
             # V R^-1 in place of V, with V^T V = R^T R: a second copy would be among the largest there are
-            factor = linalg.cholesky(scaled.T @ scaled if number else gram, check_finite=False)
+            factor = linalg.cholesky(scaled.T @ scaled if again else gram, check_finite=False)
             inverse = linalg.solve_triangular(factor, np.eye(len(factor)), check_finite=False)
             for start in range(0, len(scaled), ROWS):
                 scaled[start : start + ROWS] = scaled[start : start + ROWS] @ inverse
