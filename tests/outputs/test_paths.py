@@ -14,11 +14,10 @@ import pytest
 
 from palpate.cli import main
 from palpate.errors import ResourceError
-from palpate.export.case_files import file_name
+from palpate.export.case_files import file_name, write_mesh_files
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.steps.previewing import new_case_with_page
-from palpate.study import run
 from palpate.study.case_file import read_case
 from palpate.study.outputs import OutputFolder, staged
 from palpate.study.result import MeshResult
@@ -136,15 +135,13 @@ def test_file_names_made_of_tissues_have_bytes_to_spare(tmp_path, letter):
     (tmp_path / f"00_{name}_before.vtp").touch()
 
 
-def test_a_tissue_of_sixty_letters_of_four_bytes_has_its_surface(tmp_path, monkeypatch, case_result):
+def test_a_tissue_of_sixty_letters_of_four_bytes_has_its_surface(tmp_path, case_result):
     mesh = case_result.space.mesh
     named = dataclasses.replace(mesh, tissues=(dataclasses.replace(mesh.tissues[0], name=60 * "𝒜"), *mesh.tissues[1:]))
     space = dataclasses.replace(case_result.space, mesh=named)
     made = MeshResult(case_result.case, space, case_result.mesh_summary, case_result.before, case_result.provenance)
-    monkeypatch.setattr(run, "make_mesh", lambda _, **__: made)
-    (tmp_path / "case.toml").write_text('id = "a"\n[phantom]\nkind = "spheres"\n')
-    assert main(["mesh", str(tmp_path / "case.toml"), "--output", str(tmp_path / "out"), "--quiet"]) == 0
-    assert [path.name for path in (tmp_path / "out" / "surfaces").glob("00_*")] == [f"00_{15 * '𝒜'}_before.vtp"]
+    write_mesh_files(made, tmp_path)
+    assert [path.name for path in (tmp_path / "surfaces").glob("00_*")] == [f"00_{15 * '𝒜'}_before.vtp"]
 
 
 def test_modules_of_the_working_folder_are_not_run(tmp_path):

@@ -13,12 +13,6 @@ from palpate.report.pictures import mesh_png, organs_png, section_faces
 from palpate.report.render import Camera, Triangles, render_png
 
 
-@pytest.fixture(autouse=True)
-def fine_pictures(monkeypatch):
-    """As a report has them."""
-    monkeypatch.setattr("palpate.report.render.FINE", 2)
-
-
 def square(size, depth, colour):
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * size / 2 + [0, 0, depth]
     faces = corners[np.array([[0, 1, 2], [0, 2, 3]])]

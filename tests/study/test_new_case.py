@@ -16,6 +16,7 @@ from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.label_table import CLASSES, read_label_table
 from palpate.images.readers import read_label_image, write_label_image
 from palpate.images.tissue import Role
+from palpate.progress import silent
 from palpate.study import check
 from palpate.study.case_file import read_case
 from palpate.study.cost import expected_cost
@@ -100,8 +101,7 @@ def test_an_image_of_one_label_is_refused():
         guess_tissues(LabelImage(np.zeros((30, 30, 30), dtype=np.int32), GRID))
 
 
-def test_the_case_is_read_by_its_reader_with_paths_that_lead_to_the_images(folder, capsys, monkeypatch):
-    monkeypatch.setattr(check, "make_body", lambda *_, **__: None)  # meshes are made by other tests
+def test_the_case_is_read_by_its_reader_with_paths_that_lead_to_the_images(folder, capsys):
     command = ["init", str(folder / "b.nii.gz"), str(folder / "a.nii.gz"), "--labels", str(folder / "names.json")]
     assert main([*command, "--output", str(folder / "new" / "case 1"), "--json", "--quiet"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -114,7 +114,7 @@ def test_the_case_is_read_by_its_reader_with_paths_that_lead_to_the_images(folde
     assert case.images.before.resolve() == (folder / "b.nii.gz").resolve()
     assert str(folder) not in path.read_text()
     assert "'rectum' is hollow" in path.read_text()
-    assert main(["check", str(path), "--quiet"]) == 0
+    assert check.checked_case(path, progress=silent, meshed=False).report.exit_code == 0
 
 
 def test_what_cannot_be_guessed_is_asked_for_and_then_refused_by_its_key(folder):
