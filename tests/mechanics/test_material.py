@@ -181,6 +181,19 @@ def test_an_updated_reduced_basis_misses_nothing_of_what_follows_the_material(bo
     assert np.linalg.norm(missing) < 0.05 * np.linalg.norm(before)
 
 
+def test_responses_to_the_material_are_made_anew_far_away_without_another_factorisation(body, modes, coefficients, rng):
+    model, every = linear_model(*body, material=modes), np.concatenate(coefficients)
+    first = reduced_basis(model, MODULI)
+    first = first.with_material(first.system.material_responses(model.solve(MODULI, every).values), MODULI)
+    moduli, n, column = MODULI * [2.0, 1.0], model.n_regions + len(every), model.n_regions + body[1].n_modes
+    basis = first.update(LinearisationPoint(moduli, every, rng.normal(size=(n, 2)), np.eye(n)))
+    homogeneous = np.concatenate([coefficients[0], 0.0 * coefficients[1]])
+    exact, found = (of.solve(moduli, homogeneous).tangent()[:, column:] for of in (model, basis.model))
+    assert basis.counts.factorisations == first.counts.factorisations
+    assert np.array_equal(basis.material_at, moduli)
+    assert np.all(np.linalg.norm(found - exact, axis=0) < 0.005 * np.linalg.norm(exact, axis=0))
+
+
 @pytest.mark.parametrize("dilatation", list(Dilatation))
 def test_the_linear_law_is_the_small_strain_limit_of_a_patchy_body(body, modes, coefficients, dilatation):
     """To first order in the material: a hundredth of the motion and of the modes, derivatives and all."""
