@@ -300,10 +300,7 @@ def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIte
         return replace(there, correlated=correlated), minimum.evaluation, spent
     left = float(np.max(linearisation_error(objective, minimum) / tolerance, initial=0.0)) if rule.derivatives else 0.0
     checks, judged, missing = now.checks, minimum.evaluation, np.inf
-    trusted = all(np.isinf(approximation.trust_radius) for approximation in objective.approximations)
-    if trusted and np.isfinite(left) and np.any(moved >= NEAR.tolerance(minimum, n)):
-        left, missing = 0.0, 0.0  # so far from the end nothing is asked of a model that holds however far
-    elif left < 1.0:  # else it is made exact in any case
+    if left < 1.0:  # else it is made exact in any case
         _, off, cost = model_error(objective, minimum)
         checks, missing = checks + cost, float(np.max(off / (rule.model_error * tolerance), initial=0.0))
     if max(missing, left) >= 1.0:
