@@ -188,16 +188,15 @@ def flaw_of(command: str, folder: Path, seen: dict[str, Any], text: str) -> str:
     lines = text.strip().splitlines()
     if "Traceback" in text or "bug" in text or seen["code"] not in (0, 6):
         return f"ended with {seen['code']}: {text[-600:]}"
-    completed = seen["code"] == 6 and "completes them" in text and seen["state"] == "new"  # by the next run
-    if command == "init" and not seen["page"] and seen["state"] == "new":
-        said = seen["code"] == 6 and "case.toml is written, but not what shows it" in text and len(lines) == 1
-        return "" if said or completed else f"code {seen['code']}, the preview is missing without a word: {text[-600:]}"
+    whole = ("completes them", "case.toml is written, but not what shows it")  # by the next run; but for the preview
+    completed = seen["code"] == 6 and seen["state"] == "new" and any(words in text for words in whole)
     if seen["state"] == "mixed" or ((seen["state"] == "new") != (seen["code"] == 0) and not completed):
         return f"code {seen['code']}, but the folder is {seen['state']}: {text[-600:]}"
     if seen["code"] == 6 and len(lines) != 1:
         return f"not one sentence: {text[-600:]}"
     if not seen["page"] and seen["state"] == "new":
-        said = command == "estimate" and '"code": "report"' in (folder / "result.json").read_text()
+        said = command == "init" and completed
+        said |= command == "estimate" and '"code": "report"' in (folder / "result.json").read_text()
         return "" if said else "the page is missing without a word"
     return f"left {leftovers(folder)}" if leftovers(folder) else ""
 

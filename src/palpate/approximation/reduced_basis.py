@@ -23,6 +23,7 @@ FAR = 30.0  # spread of the moduli's ratios to the factorised ones, beyond which
 SNAPSHOT = 1e-5  # relative residual of basis vectors: what they miss is measured at each place and added there
 DISPLACEMENT, TANGENT = 1e-4, 1e-2  # of the reduced model's error, that a correction may leave
 STALE = 0.3  # of ln E, from which on all responses to the material modes are made anew
+MANY = 128  # responses to material modes, as those of a map, that cost more by iterations than by a factor of their own
 FAR_OFF = 3e-3  # of the displacement, missing: derivatives are off by as small a share
 MAX_ITERATIONS = 60
 
@@ -81,8 +82,9 @@ class ReducedBasis:
         model, near, sharper = self.full_model, self.system, self
         direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
         ratios, stale = at.moduli / near.moduli, at.directions is not None and self._stale(at.moduli)
-        # solutions that iterate themselves help none
-        if not direct or ratios.max() >= FAR * ratios.min():
+        many = stale and model.material.n_modes > MANY
+        # solutions that iterate themselves help none; many right-hand sides are worth a factorisation of their own
+        if many or not direct or ratios.max() >= FAR * ratios.min():
             near = model.system(at.moduli)
             sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=1))
         matrix = weighted_sum(at.moduli, model.free_stiffness)
@@ -207,19 +209,15 @@ def _with_all_material(
 ) -> ReducedBasis:
     """All responses to the material modes made exact at a place, from what they are elsewhere.
 
-    matrix (n_free, n_free): the stiffness there, as in what follows.
+    displacement (n_dof,) mm and stiffness `matrix` (n_free, n_free) mN/mm there; solved: see `ReducedBasis.update`.
     """
     model, free, n = basis.full_model, basis.constraint.free, basis.full_model.material.n_modes
-    responses, by_material = np.zeros((len(displacement), n)), model.by_material(at.moduli, displacement)
+    by_material, responses = model.by_material(at.moduli, displacement), basis.model.output_material.copy()
     for start in range(0, n, AT_ONCE):
         some = slice(start, start + AT_ONCE)
         loads = -np.asarray(free.T @ by_material.along(np.eye(n)[:, some]))
-        if len(basis.material_at):
-            known = np.asarray(free.T @ basis.model.output_material[:, some])
-            found = known + solved(loads - times(matrix, known), TANGENT)
-        else:
-            found = solved(loads, TANGENT)
-        responses[:, some] = np.asarray(free @ found)
+        known = np.asarray(free.T @ responses[:, some])
+        responses[:, some] += np.asarray(free @ solved(loads - times(matrix, known), TANGENT))
     return replace(basis, counts=basis.counts + SolveCounts(tangent=n)).with_material(responses, at.moduli)
 
 

@@ -43,7 +43,7 @@ def times(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -
 
 
 def column_norms(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lengths (k,) of columns (n, k), which NumPy's own norm takes thirty times as long for."""
+    """Lengths (k,) of columns (n, k), in their unit; NumPy's own norm takes thirty times as long."""
     return np.asarray(np.sqrt(np.einsum("ij,ij->j", vectors, vectors)))
 
 
