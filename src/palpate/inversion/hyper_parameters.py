@@ -195,24 +195,39 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     With A = J^T W J and b = A x - J^T W r at unknowns x (n_unknowns,) the log-evidence of P is 1/2 (b^T (A + P)^-1 b -
     ln det(A + P) + ln det P) up to a constant (MacKay 1992, Neural Computation 4, 415-447, section 4), the other blocks
     under their present prior. An alternative stays until another one is more than as good; of a material the first one.
+    Of blocks that are learned last the one that gains most has its choice first: the first of them would else take what
+    another one explains better.
     """
     parameters, n = objective.parameters, objective.n_parameters
     chosen = list(objective.chosen or (None,) * len(parameters.blocks))
     data, prior = evaluation.matrix - evaluation.prior, evaluation.prior.copy()
     pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
-    for i, block in enumerate(parameters.blocks):
-        if not block.alternatives or (block.last and not objective.learn_last):
-            continue
-        places = parameters.columns(i)
+
+    def choice(i: int) -> tuple[float, int, NDArray[np.float64]]:
+        """What a block gains by another alternative, the number of its own from now on, and that one's covariance."""
+        block, places, present = parameters.blocks[i], parameters.columns(i), chosen[i]
         beliefs = _beliefs(block, places, data, prior, pull + prior @ parameters.prior_centre)
-        best, present = max(range(len(beliefs)), key=lambda k: beliefs[k][0]), chosen[i]
+        best = max(range(len(beliefs)), key=lambda k: beliefs[k][0])
         if present is None and block.acts is Acts.MATERIAL:
             present = 0
-        if present is None or beliefs[best][0] > beliefs[present][0] + AS_GOOD:
+        gain = np.inf if present is None else beliefs[best][0] - beliefs[present][0]
+        if present is None or gain > AS_GOOD:
             present = best
-        chosen[i] = present
-        with determined():
-            prior[np.ix_(places, places)] = linalg.inv(beliefs[present][1])
+        return gain, present, beliefs[present][1]
+
+    learned = [i for i, block in enumerate(parameters.blocks) if block.alternatives]
+    rounds = [[i] for i in learned if not parameters.blocks[i].last]
+    if objective.learn_last:
+        rounds.append([i for i in learned if parameters.blocks[i].last])
+    for left in rounds:
+        while left:
+            choices = {i: choice(i) for i in left}
+            i = max(left, key=lambda k: choices[k][0])
+            _, chosen[i], believed = choices[i]
+            places = parameters.columns(i)
+            left.remove(i)
+            with determined():
+                prior[np.ix_(places, places)] = linalg.inv(believed)
     parameters = replace(parameters, nuisance_precision=prior[n:, n:])
     return replace(objective, parameters=parameters, chosen=tuple(chosen))
 

@@ -33,7 +33,8 @@ FIELD = "field"
 LEFT_OUT, LEFT_OUT_OF_MAP = 1.0, 0.3  # see `Block.left_out`; what is left out of a map is missing in it
 FIELD_AMPLITUDES = (1.0, 2.0)  # of a tissue that is mapped, times the standard deviation stated
 CONSIDERED = 1e8  # times its precision: an unknown that is considered does not move
-HOMOGENEOUS_SHARE, PATCHY = 1.0 / 3.0, 0.3  # sd of ln E in a tissue that is nearly homogeneous, over that stated; odds
+PATCHINESS = (1.0 / 3.0, 1.0, 2.0)  # sd of ln E in a tissue that is nearly homogeneous, patchy, very; over that stated
+PATCHY_ODDS = (0.0, -1.2, -2.3)  # log prior odds of these: 1, 0.3, 0.1
 
 
 class Acts(Enum):
@@ -196,9 +197,9 @@ def material_blocks(
         start, end = end, end + n
         if not n:
             continue
-        cause, sd, shares, odds = "heterogeneity", heterogeneity_sd, (HOMOGENEOUS_SHARE, 1.0), float(np.log(PATCHY))
+        cause, sd, shares, odds = "heterogeneity", heterogeneity_sd, PATCHINESS, PATCHY_ODDS
         if mapped := tissues[tissue].field:
-            cause, sd, shares, odds = FIELD, mapped.sd, FIELD_AMPLITUDES, 0.0
+            cause, sd, shares, odds = FIELD, mapped.sd, FIELD_AMPLITUDES, (0.0, 0.0)
         first, *_ = levels = [(share * sd) ** 2 for share in shares]
         edges = mapped if mapped and mapped.total_variation else None
         blocks.append(
@@ -210,7 +211,7 @@ def material_blocks(
                 np.eye(n) / first,
                 () if edges else tuple((level * np.eye(n),) for level in levels),
                 amplitudes=(1.0, 1.0),
-                odds=() if edges else (0.0, odds),
+                odds=() if edges else odds,
                 last=mapped is None,
                 left_out=LEFT_OUT if mapped is None else LEFT_OUT_OF_MAP,
                 variation=total_variation(mesh, modes.fields[:, start:end], edges) if edges else None,
