@@ -17,7 +17,7 @@ from palpate.inversion import (
     with_first_noise,
     with_hyper_parameters,
 )
-from palpate.inversion.hyper_parameters import fitted_noise, with_scales
+from palpate.inversion.hyper_parameters import fitted_noise, with_amplitudes, with_scales
 from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns import Block
 from palpate.unknowns.blocks import Acts
@@ -175,3 +175,26 @@ def test_what_is_learned_last_waits_until_it_is_asked_for(minimum):
     here = linear(one, found)(found.unknowns)
     assert with_hyper_parameters(one, here, found.unknowns).chosen == (None,)
     assert with_hyper_parameters(replace(one, learn_last=True), here, found.unknowns).chosen == (1,)
+
+
+@pytest.mark.parametrize("likelier", [0, 1])
+def test_of_two_causes_of_one_sight_the_likelier_is_taken_in_whichever_order_they_stand(minimum, likelier):
+    objective, found = minimum
+    n, m = objective.n_parameters, objective.parameters.n_coefficients
+    sum_of_two = np.zeros(n + m)
+    sum_of_two[[n, n + 1]] = 1.0
+    seen = 100.0 * np.outer(sum_of_two, sum_of_two)
+    blocks = [
+        Block("a", "wall", Acts.BOUNDARY, (0,), np.eye(size) / 0.1**2, terms, (1.0, 1.0), odds=(0.0, odd), last=True)
+        for size, odd in ((1, -1.0 if likelier else 0.0), (m - 1, 0.0 if likelier else -1.0))
+        for terms in [tuple((level**2 * np.eye(size),) for level in (0.1, 1.0))]
+    ]
+    parameters = replace(objective.parameters, blocks=tuple(blocks), nuisance_precision=np.eye(m) / 0.1**2)
+    objective = replace(objective, parameters=parameters, chosen=(0, 0), learn_last=True)
+    prior = parameters.prior_matrix
+    unknowns = sum_of_two  # both follow by half of what is seen, 2
+    evaluation = replace(
+        found.evaluation, matrix=seen + prior, prior=prior, score=prior @ unknowns, prior_score=prior @ unknowns
+    )
+    chosen = with_amplitudes(objective, evaluation, unknowns).chosen
+    assert chosen == ((0, 1) if likelier else (1, 0))

@@ -204,28 +204,25 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
 
     def choice(i: int) -> tuple[float, int, NDArray[np.float64]]:
-        """What a block gains by another alternative, the number of its own from now on, and that one's covariance."""
-        block, places, present = parameters.blocks[i], parameters.columns(i), chosen[i]
-        beliefs = _beliefs(block, places, data, prior, pull + prior @ parameters.prior_centre)
+        """What a block gains by its best alternative, the number of the one it takes, and that one's covariance."""
+        block, present = parameters.blocks[i], chosen[i]
+        beliefs = _beliefs(block, parameters.columns(i), data, prior, pull + prior @ parameters.prior_centre)
         best = max(range(len(beliefs)), key=lambda k: beliefs[k][0])
         if present is None and block.acts is Acts.MATERIAL:
             present = 0
         gain = np.inf if present is None else beliefs[best][0] - beliefs[present][0]
-        if present is None or gain > AS_GOOD:
-            present = best
-        return gain, present, beliefs[present][1]
+        taken = best if present is None or gain > AS_GOOD else present
+        return gain, taken, beliefs[taken][1]
 
     learned = [i for i, block in enumerate(parameters.blocks) if block.alternatives]
-    rounds = [[i] for i in learned if not parameters.blocks[i].last]
-    if objective.learn_last:
-        rounds.append([i for i in learned if parameters.blocks[i].last])
-    for left in rounds:
-        while left:
-            choices = {i: choice(i) for i in left}
-            i = max(left, key=lambda k: choices[k][0])
+    last = [i for i in learned if parameters.blocks[i].last]
+    for waiting in (*([i] for i in learned if i not in last), last if objective.learn_last else []):
+        while waiting:
+            choices = {i: choice(i) for i in waiting}
+            i = max(waiting, key=lambda k: choices[k][0])
+            waiting.remove(i)
             _, chosen[i], believed = choices[i]
             places = parameters.columns(i)
-            left.remove(i)
             with determined():
                 prior[np.ix_(places, places)] = linalg.inv(believed)
     parameters = replace(parameters, nuisance_precision=prior[n:, n:])

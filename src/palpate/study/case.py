@@ -49,10 +49,11 @@ class Domain:
 class Discrepancy:
     """What the model leaves out, as unknowns with these prior standard deviations; 0 leaves one out.
 
-    heterogeneity_sd: of ln E inside a patchy tissue, with a Gaussian kernel of heterogeneity_length_mm, and a third of
-    it inside one that is nearly homogeneous, of which the images choose; poisson_sd: of each Poisson's ratio that is
-    given; surface_offset_mm: of how much larger each surface, and each driver's wall, is drawn in each later image;
-    layer_sd: of ln E of a layer of layer_mm between each organ and what is known round it, over that tissue's own.
+    heterogeneity_sd: of ln E inside a patchy tissue, with a Gaussian kernel of heterogeneity_length_mm; a third of it
+    inside one that is nearly homogeneous, twice of it inside a very patchy one, of which the images choose; poisson_sd:
+    of each Poisson's ratio that is given; surface_offset_mm: of how much larger each surface, and each driver's wall,
+    is drawn in each later image; layer_sd: of ln E of a layer of layer_mm between each organ and what is known round
+    it, over that tissue's own.
     """
 
     heterogeneity_sd: float = field(default=0.3, metadata=rule(between=(0.0, 3.0)))

@@ -104,8 +104,8 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
             value, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(variance))
             offsets.append(OffsetFound(block.of, block.states[0], value, (value - half, value + half)))
         elif block.cause == "heterogeneity":
-            patchy = max(float(term[0, 0]) for terms in block.alternatives for term in terms)
-            heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(patchy))))
+            patchy = block.alternatives[1][0]
+            heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(np.mean(np.diag(patchy))))))
         elif block.cause == "frame":
             smooth.setdefault(block.states[0], learned * block.unit_mm)
     frames = list[FrameFound | None]([None] * len(states))

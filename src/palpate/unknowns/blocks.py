@@ -33,8 +33,9 @@ FIELD = "field"
 LEFT_OUT, LEFT_OUT_OF_MAP = 1.0, 0.3  # see `Block.left_out`; what is left out of a map is missing in it
 FIELD_AMPLITUDES = (1.0, 2.0)  # of a tissue that is mapped, times the standard deviation stated
 CONSIDERED = 1e8  # times its precision: an unknown that is considered does not move
-PATCHINESS = (1.0 / 3.0, 1.0, 2.0)  # sd of ln E in a tissue that is nearly homogeneous, patchy, very; over that stated
-PATCHY_ODDS = (0.0, -1.2, -2.3)  # log prior odds of these: 1, 0.3, 0.1
+# sd of ln E in a tissue that is nearly homogeneous, patchy, very patchy, over that stated; log prior odds of these
+PATCHINESS: tuple[float, ...] = (1.0 / 3.0, 1.0, 2.0)
+PATCHY_ODDS = (0.0, -1.2, -2.3)
 
 
 class Acts(Enum):
@@ -186,21 +187,22 @@ def material_blocks(
 ) -> tuple[Block, ...]:
     """How ln E varies in each tissue, and by how much Poisson's ratios are not those given.
 
-    A tissue is nearly homogeneous, by a third of what is stated, or patchy by all of it, of which the evidence chooses;
-    surfaces hardly tell the two apart, so that the former stays until the latter is clearly more likely. The field of a
-    tissue that is mapped has the amplitude that is stated until twice of it is clearly more likely. It has no less: a
-    small part that differs in a tissue that is else homogeneous speaks for a small amplitude, which hides it. Where its
-    prior is the total variation nothing is chosen.
+    A tissue is nearly homogeneous, by a third of what is stated, patchy by all of it, or very patchy by twice of it, of
+    which the evidence chooses; surfaces hardly tell these apart, so that the first stays until another one is clearly
+    more likely. The field of a tissue that is mapped has the amplitude that is stated until twice of it is clearly more
+    likely. It has no less: a small part that differs in a tissue that is else homogeneous speaks for a small amplitude,
+    which hides it. Where its prior is the total variation nothing is chosen.
     """
     blocks, tissues, end = [], mesh.tissues, 0
     for tissue, n in modes.sizes:
         start, end = end, end + n
         if not n:
             continue
-        cause, sd, shares, odds = "heterogeneity", heterogeneity_sd, PATCHINESS, PATCHY_ODDS
+        cause, sd, shares = "heterogeneity", heterogeneity_sd, PATCHINESS
         if mapped := tissues[tissue].field:
-            cause, sd, shares, odds = FIELD, mapped.sd, FIELD_AMPLITUDES, (0.0, 0.0)
+            cause, sd, shares = FIELD, mapped.sd, FIELD_AMPLITUDES
         first, *_ = levels = [(share * sd) ** 2 for share in shares]
+        odds = (0.0,) * len(levels) if mapped else PATCHY_ODDS
         edges = mapped if mapped and mapped.total_variation else None
         blocks.append(
             Block(
