@@ -33,9 +33,10 @@ FIELD = "field"
 LEFT_OUT, LEFT_OUT_OF_MAP = 1.0, 0.3  # see `Block.left_out`; what is left out of a map is missing in it
 FIELD_AMPLITUDES = (1.0, 2.0)  # of a tissue that is mapped, times the standard deviation stated
 CONSIDERED = 1e8  # times its precision: an unknown that is considered does not move
-# sd of ln E in a tissue that is nearly homogeneous, patchy, very patchy, over that stated; log prior odds of these
+# sd of ln E in a tissue that is nearly homogeneous, patchy, very patchy, over that stated; log prior odds of these: not
+# homogeneous is 3 to 10, by how much as likely the one as the other
 PATCHINESS: tuple[float, ...] = (1.0 / 3.0, 1.0, 2.0)
-PATCHY_ODDS = (0.0, -1.2, -2.3)
+PATCHY_ODDS = (0.0, -1.9, -1.9)
 
 
 class Acts(Enum):
