@@ -205,8 +205,10 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
 
     def choice(i: int) -> tuple[float, int, NDArray[np.float64]]:
         """What a block gains by its best alternative, the number of the one it takes, and that one's covariance."""
-        block, present = parameters.blocks[i], chosen[i]
+        block, present = _open(parameters.blocks, i, chosen), chosen[i]
         beliefs = _beliefs(block, parameters.columns(i), data, prior, pull + prior @ parameters.prior_centre)
+        if present is not None and present >= len(beliefs):
+            present = None
         best = max(range(len(beliefs)), key=lambda k: beliefs[k][0])
         if present is None and block.acts is Acts.MATERIAL:
             present = 0
@@ -279,14 +281,16 @@ def undecided_covariance(
         return solved[:n, n], solved[:n, :n]
 
     found = dict[str, NDArray[np.float64]]()
+    every = objective.chosen or (None,) * len(parameters.blocks)
     with determined():
         mean, covariance = posterior(prior)
-        for i, block in enumerate(parameters.blocks):
+        for i in range(len(parameters.blocks)):
+            block = _open(parameters.blocks, i, every)
             if not block.odds:
                 continue
             places = parameters.columns(i)
             beliefs = _beliefs(block, places, data, prior, pull + prior @ centre)
-            chosen = (objective.chosen[i] if objective.chosen else None) or 0
+            chosen = every[i] or 0
             evidences = np.array([evidence for evidence, _ in beliefs])
             shares = np.exp(evidences - evidences.max())
             shares /= shares.sum()
@@ -301,6 +305,13 @@ def undecided_covariance(
             sizes, axes = np.linalg.eigh(part)  # an alternative that knows more makes nothing narrower
             found[block.cause] = found.get(block.cause, np.zeros((n, n))) + (axes * np.maximum(sizes, 0.0)) @ axes.T
     return found
+
+
+def _open(blocks: Sequence[Block], number: int, chosen: Sequence[int | None]) -> Block:
+    """A block with the alternatives that it has beside those `chosen` of the others (see `Block.rivals`)."""
+    block = blocks[number]
+    rivals = any(k for other, k in zip(blocks, chosen, strict=True) if other.cause in block.rivals)
+    return replace(block, alternatives=block.alternatives[:-1], odds=block.odds[:-1]) if rivals else block
 
 
 def _beliefs(

@@ -28,7 +28,7 @@ AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
 STILL, MOVES = 0.02, (1.0, 2.0)  # amplitudes of a frame that stands still, times what is stated; of one that moves
 STILL_RIGID, MOVED_RIGID = 0.005, 0.2
 DRAWN_ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often not
-KNOWN_MODULUS = "known modulus"
+KNOWN_MODULUS, FRAME = "known modulus", "frame"
 FIELD = "field"
 LEFT_OUT, LEFT_OUT_OF_MAP = 1.0, 0.3  # see `Block.left_out`; what is left out of a map is missing in it
 FIELD_AMPLITUDES = (1.0, 2.0)  # of a tissue that is mapped, times the standard deviation stated
@@ -59,8 +59,9 @@ class Block:
     odds of the alternatives, of which the likeliest is taken; none: of alternatives that are alike the widest.
     considered: the images cannot tell them, so that they are held at 0, and what they may be counts in the covariance
     (Schmidt 1966). last: its prior is learned where the estimate has converged under those of the others; before it
-    would take what they explain. released: held at 0 as well while an estimate is sought, and free under P where its
-    interval is. left_out: variances of the first noise, a tenth of the found one, that what is left out of the unknowns
+    would take what they explain. rivals: causes that explain as much as its last alternative, which is none where a
+    block of theirs has left its first one. released: held at 0 as well while an estimate is sought, and free under P
+    where its interval is. left_out: variances of the first noise, a tenth of the found one, that what is left out of the unknowns
     may explain (see `informed_problem`); below 0 none is. regions: numbers of the model's regions whose moduli it
     multiplies, one unknown x for all of them, where it acts on moduli: a `share` s of each region, in series with the
     rest of it, is e^x times as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is believed
@@ -77,6 +78,7 @@ class Block:
     odds: tuple[float, ...] = ()
     considered: bool = False
     last: bool = False
+    rivals: tuple[str, ...] = ()
     released: bool = False
     unit_mm: float = 1.0
     regions: tuple[int, ...] = ()
@@ -144,7 +146,7 @@ def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
     return tuple(
         Block(
             "frame",
-            "frame",
+            FRAME,
             Acts.BOUNDARY,
             (state,),
             np.linalg.inv(terms[-1]) if terms is rigid else np.eye(len(terms[0])),
@@ -190,9 +192,11 @@ def material_blocks(
 
     A tissue is nearly homogeneous, by a third of what is stated, patchy by all of it, or very patchy by twice of it, of
     which the evidence chooses; surfaces hardly tell these apart, so that the first stays until another one is clearly
-    more likely. The field of a tissue that is mapped has the amplitude that is stated until twice of it is clearly more
-    likely. It has no less: a small part that differs in a tissue that is else homogeneous speaks for a small amplitude,
-    which hides it. Where its prior is the total variation nothing is chosen.
+    more likely. A very patchy tissue looks like a frame that moves: where the frame moves none is very patchy, or
+    hardly an estimate with such a frame would state anything. The field of a tissue that is mapped has the amplitude
+    that is stated until twice of it is clearly more likely. It has no less: a small part that differs in a tissue that
+    is else homogeneous speaks for a small amplitude, which hides it. Where its prior is the total variation nothing is
+    chosen.
     """
     blocks, tissues, end = [], mesh.tissues, 0
     for tissue, n in modes.sizes:
@@ -216,6 +220,7 @@ def material_blocks(
                 amplitudes=(1.0, 1.0),
                 odds=() if edges else odds,
                 last=mapped is None,
+                rivals=() if mapped else (FRAME,),
                 left_out=LEFT_OUT if mapped is None else LEFT_OUT_OF_MAP,
                 variation=total_variation(mesh, modes.fields[:, start:end], edges) if edges else None,
             )
