@@ -17,7 +17,7 @@ from palpate.inversion import (
     with_first_noise,
     with_hyper_parameters,
 )
-from palpate.inversion.hyper_parameters import fitted_noise, with_amplitudes, with_scales
+from palpate.inversion.hyper_parameters import fitted_noise, undecided_covariance, with_amplitudes, with_scales
 from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns import Block
 from palpate.unknowns.blocks import Acts
@@ -177,24 +177,52 @@ def test_what_is_learned_last_waits_until_it_is_asked_for(minimum):
     assert with_hyper_parameters(replace(one, learn_last=True), here, found.unknowns).chosen == (1,)
 
 
+def two_causes(objective, found, *, levels, odds, rivals=()):
+    """Two blocks of the driver's modes, and an evaluation that sees 2 of the sum of their first ones and a modulus."""
+    n, m = objective.n_parameters, objective.parameters.n_coefficients
+    unknowns = np.zeros(n + m)
+    unknowns[[n, n + 1]] = 1.0
+    blocks = tuple(
+        Block(
+            "a",
+            cause,
+            Acts.BOUNDARY,
+            (0,),
+            np.eye(size) / own[0] ** 2,
+            tuple((level**2 * np.eye(size),) for level in own),
+            (1.0, 1.0),
+            odds=odd,
+            last=True,
+            rivals=against,
+        )
+        for cause, size, own, odd, against in zip("ab", (1, m - 1), levels, odds, ((), rivals), strict=True)
+    )
+    parameters = replace(objective.parameters, blocks=blocks, nuisance_precision=np.eye(m) / levels[0][0] ** 2)
+    prior = parameters.prior_matrix
+    seen = unknowns + np.eye(n + m)[0]
+    matrix, score = 100.0 * np.outer(seen, seen) + prior, prior @ unknowns
+    matrix[:n, :n] += 100.0 * np.eye(n)
+    evaluation = replace(found.evaluation, matrix=matrix, prior=prior, score=score, prior_score=score)
+    return replace(objective, parameters=parameters, learn_last=True), evaluation, unknowns
+
+
 @pytest.mark.parametrize("likelier", [0, 1])
 def test_of_two_causes_of_one_sight_the_likelier_is_taken_in_whichever_order_they_stand(minimum, likelier):
-    objective, found = minimum
-    n, m = objective.n_parameters, objective.parameters.n_coefficients
-    sum_of_two = np.zeros(n + m)
-    sum_of_two[[n, n + 1]] = 1.0
-    seen = 100.0 * np.outer(sum_of_two, sum_of_two)
-    blocks = [
-        Block("a", "wall", Acts.BOUNDARY, (0,), np.eye(size) / 0.1**2, terms, (1.0, 1.0), odds=(0.0, odd), last=True)
-        for size, odd in ((1, -1.0 if likelier else 0.0), (m - 1, 0.0 if likelier else -1.0))
-        for terms in [tuple((level**2 * np.eye(size),) for level in (0.1, 1.0))]
-    ]
-    parameters = replace(objective.parameters, blocks=tuple(blocks), nuisance_precision=np.eye(m) / 0.1**2)
-    objective = replace(objective, parameters=parameters, chosen=(0, 0), learn_last=True)
-    prior = parameters.prior_matrix
-    unknowns = sum_of_two  # both follow by half of what is seen, 2
-    evaluation = replace(
-        found.evaluation, matrix=seen + prior, prior=prior, score=prior @ unknowns, prior_score=prior @ unknowns
-    )
-    chosen = with_amplitudes(objective, evaluation, unknowns).chosen
-    assert chosen == ((0, 1) if likelier else (1, 0))
+    odds = [(0.0, 0.0 if k == likelier else -1.0) for k in (0, 1)]
+    objective, evaluation, unknowns = two_causes(*minimum, levels=[(0.1, 1.0)] * 2, odds=odds)
+    chosen = with_amplitudes(replace(objective, chosen=(0, 0)), evaluation, unknowns).chosen
+    assert chosen == tuple(int(k == likelier) for k in (0, 1))
+
+
+def test_the_last_alternative_is_none_where_a_rival_has_left_its_first(minimum):
+    odds = [(0.0, 0.0), (0.0, 0.0, 0.0)]
+    for rivals, frame, before, expected in (((), 1, 0, 2), (("a",), 0, 0, 2), (("a",), 1, 0, 1), (("a",), 1, 2, 1)):
+        undecided = list[float]()
+        for last in (2.0, 3.0):
+            levels = [(0.09, 0.1), (0.1, 0.2, last)]
+            objective, evaluation, unknowns = two_causes(*minimum, levels=levels, odds=odds, rivals=rivals)
+            objective = replace(objective, chosen=(frame, before))
+            assert with_amplitudes(objective, evaluation, unknowns).chosen == (frame, expected)
+            after = undecided_covariance(replace(objective, chosen=(frame, 1)), evaluation, unknowns)
+            undecided.append(after["b"][0, 0])
+        assert (undecided[0] == undecided[1]) == (expected == 1)

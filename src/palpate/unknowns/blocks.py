@@ -61,11 +61,12 @@ class Block:
     (Schmidt 1966). last: its prior is learned where the estimate has converged under those of the others; before it
     would take what they explain. rivals: causes that explain as much as its last alternative, which is none where a
     block of theirs has left its first one. released: held at 0 as well while an estimate is sought, and free under P
-    where its interval is. left_out: variances of the first noise, a tenth of the found one, that what is left out of the unknowns
-    may explain (see `informed_problem`); below 0 none is. regions: numbers of the model's regions whose moduli it
-    multiplies, one unknown x for all of them, where it acts on moduli: a `share` s of each region, in series with the
-    rest of it, is e^x times as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is believed
-    where that is not normal; an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
+    where its interval is. left_out: variances of the first noise, a tenth of the found one, that what is left out of
+    the unknowns may explain (see `informed_problem`); below 0 none is. regions: numbers of the model's regions whose
+    moduli it multiplies, one unknown x for all of them, where it acts on moduli: a `share` s of each, in series with
+    the rest of it, is e^x times as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is
+    believed where that is not normal; an estimate begins with P then. Raises `ConfigurationError` for terms of another
+    size.
     """
 
     of: str
