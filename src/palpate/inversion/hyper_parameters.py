@@ -205,15 +205,16 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
 
     def choice(i: int) -> tuple[float, int, NDArray[np.float64]]:
         """What a block gains by its best alternative, the number of the one it takes, and that one's covariance."""
-        block, present = _open(parameters.blocks, i, chosen), chosen[i]
+        block = _admissible(parameters.blocks, i, chosen)
         beliefs = _beliefs(block, parameters.columns(i), data, prior, pull + prior @ parameters.prior_centre)
-        if present is not None and present >= len(beliefs):
-            present = None
         best = max(range(len(beliefs)), key=lambda k: beliefs[k][0])
+        present = chosen[i] if chosen[i] in range(len(beliefs)) else None
         if present is None and block.acts is Acts.MATERIAL:
             present = 0
-        gain = np.inf if present is None else beliefs[best][0] - beliefs[present][0]
-        taken = best if present is None or gain > AS_GOOD else present
+        if present is None:
+            return np.inf, best, beliefs[best][1]
+        gain = beliefs[best][0] - beliefs[present][0]
+        taken = best if gain > AS_GOOD else present
         return gain, taken, beliefs[taken][1]
 
     learned = [i for i, block in enumerate(parameters.blocks) if block.alternatives]
@@ -281,16 +282,16 @@ def undecided_covariance(
         return solved[:n, n], solved[:n, :n]
 
     found = dict[str, NDArray[np.float64]]()
-    every = objective.chosen or (None,) * len(parameters.blocks)
+    numbers = objective.chosen or (None,) * len(parameters.blocks)
     with determined():
         mean, covariance = posterior(prior)
         for i in range(len(parameters.blocks)):
-            block = _open(parameters.blocks, i, every)
+            block = _admissible(parameters.blocks, i, numbers)
             if not block.odds:
                 continue
             places = parameters.columns(i)
             beliefs = _beliefs(block, places, data, prior, pull + prior @ centre)
-            chosen = every[i] or 0
+            chosen = numbers[i] or 0
             evidences = np.array([evidence for evidence, _ in beliefs])
             shares = np.exp(evidences - evidences.max())
             shares /= shares.sum()
@@ -307,8 +308,8 @@ def undecided_covariance(
     return found
 
 
-def _open(blocks: Sequence[Block], number: int, chosen: Sequence[int | None]) -> Block:
-    """A block with the alternatives that it has beside those `chosen` of the others (see `Block.rivals`)."""
+def _admissible(blocks: Sequence[Block], number: int, chosen: Sequence[int | None]) -> Block:
+    """A block with the alternatives that are left to it by those `chosen` for the others (see `Block.rivals`)."""
     block = blocks[number]
     rivals = any(k for other, k in zip(blocks, chosen, strict=True) if other.cause in block.rivals)
     return replace(block, alternatives=block.alternatives[:-1], odds=block.odds[:-1]) if rivals else block

@@ -104,7 +104,7 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
             value, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(variance))
             offsets.append(OffsetFound(block.of, block.states[0], value, (value - half, value + half)))
         elif block.cause == "heterogeneity":
-            patchy = block.alternatives[1][0]
+            patchy = block.alternatives[1][0]  # the first is nearly homogeneous, the last very patchy
             heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(np.mean(np.diag(patchy))))))
         elif block.cause == "frame":
             smooth.setdefault(block.states[0], learned * block.unit_mm)
