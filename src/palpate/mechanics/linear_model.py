@@ -288,12 +288,13 @@ class LinearSystem:
         K(E) >= min_r(E_r / E0_r) K(E0): |e|_K / |u|_K <= sqrt(r^T K(E0)^-1 r / min_r(E_r / E0_r)) / |u|_K.
         Source: Patera & Rozza, Reduced Basis Approximation (2007), section 4.2 (min-theta approach).
         """
-        residual = self.model.residual(moduli, displacement[:, None]) + further
+        forces, constraint = self.model.forces(moduli, displacement[:, None]), self.model.constraint
+        residual = np.asarray(constraint.free.T @ forces) - self.model.free_load[:, None] + further
         missing = -self.factorisation.solve(residual, tolerance=OF_ERROR)
-        energy = float(displacement @ self.model.forces(moduli, displacement[:, None])[:, 0])
+        energy = float(displacement @ forces[:, 0])
         least = float(np.min(np.asarray(moduli) / self.moduli))
         squared = float(-residual[:, 0] @ missing[:, 0]) / least / max(energy, np.finfo(float).tiny)
-        return float(np.sqrt(max(squared, 0.0))), np.asarray(self.model.constraint.free @ missing)[:, 0]
+        return float(np.sqrt(max(squared, 0.0))), np.asarray(constraint.free @ missing)[:, 0]
 
 
 @dataclass(frozen=True, slots=True)

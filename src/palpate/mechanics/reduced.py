@@ -206,17 +206,18 @@ class Projection:
         snapshots = _checked(self.model, snapshots)
         lengths = column_norms(snapshots)
         fresh = snapshots[:, lengths > 0.0] / lengths[lengths > 0.0]
-        for _ in range(2):  # once leaves the rounding of what it takes away
-            fresh = fresh - self.spanned(self.components(fresh))
+        fresh = fresh - self.spanned(self.components(fresh))
         fresh = fresh[:, column_norms(fresh) > RANK_TOLERANCE]
         if not fresh.shape[1]:
             return self
         fresh = orthonormal_basis(fresh)
+        # once leaves the rounding of what it takes away
         fresh = orthonormal_basis(fresh - self.spanned(self.components(fresh)))
         model, old, blocks = self.model, self.reduced, []
-        for matrix, block in zip(model.free_stiffness, old.stiffness, strict=True):
-            image = times(matrix, fresh)
-            side, corner = self.components(image), fresh.T @ image
+        images = [times(matrix, fresh) for matrix in model.free_stiffness]
+        sides = np.split(self.components(np.concatenate(images, axis=1)), len(images), axis=1)
+        for image, side, block in zip(images, sides, old.stiffness, strict=True):
+            corner = fresh.T @ image
             blocks.append(np.block([[block, side], [side.T, 0.5 * (corner + corner.T)]]))
         reduced = replace(
             old,
@@ -241,10 +242,10 @@ def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection
     stiffness = np.empty((len(model.free_stiffness), vectors.shape[1], vectors.shape[1]))
     for own, matrix in zip(stiffness, model.free_stiffness, strict=True):  # V^T A V; A is empty but for its own rows
         touched = np.flatnonzero(np.diff(matrix.indptr))
-        rows = vectors[touched]
+        rows, touching = vectors[touched], matrix[touched]
         for start in range(0, vectors.shape[1], CHUNK):
             columns = slice(start, start + CHUNK)
-            own[:, columns] = rows.T @ times(matrix, vectors[:, columns])[touched]
+            own[:, columns] = rows.T @ times(touching, vectors[:, columns])
         own[:] = 0.5 * (own + own.T)
     load, coupling = np.asarray(vectors.T @ model.free_load), _coupling(model, vectors)
     outputs, constraint = np.asarray(model.constraint.free @ vectors), model.constraint
