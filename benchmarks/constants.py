@@ -1,6 +1,7 @@
 """Whether an answer hangs on the constants of the inversion, on the machine, or on where it begins.
 
-    python benchmarks/constants.py [--rows clean,finite-clean] [--only NAME,...] [--seed S] [--edge MM] [--json]
+    python benchmarks/constants.py [--rows clean,finite-clean] [--only NAME,...] [--seed S] [--edge MM] [--defaults]
+        [--json]
 
 Simulated data: rows of accuracy.py. An estimate is made with each number that stands in capitals in `palpate.inversion`
 half and twice as large (shares of a whole at most the mean of themselves and 1); the table says how far the log-moduli
@@ -56,6 +57,7 @@ def main() -> int:
     parser.add_argument("--only", help="some of the changes instead of all")
     parser.add_argument("--seed", type=int, default=101)
     parser.add_argument("--edge", type=float, help="edge length (mm) instead of the row's own")
+    parser.add_argument("--defaults", action="store_true", help="the program's defaults: nothing is held")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     arguments = parser.parse_args()
     found, every = [], [*CONDITIONS, *constants()]
@@ -64,7 +66,7 @@ def main() -> int:
     if unknown := [name for name in asked if name not in names]:
         parser.error(f"--only {', '.join(unknown)}: it must name some of {', '.join(names)}")
     for name in arguments.rows.split(","):
-        row = ROWS[name] if arguments.edge is None else replace(ROWS[name], edge_mm=arguments.edge)
+        row = replace(ROWS[name], held=not arguments.defaults, edge_mm=arguments.edge or ROWS[name].edge_mm)
         case = posed(row, arguments.seed, 0, {})
         theta, sd = _answer(case)
         for change in every:

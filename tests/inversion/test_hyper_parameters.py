@@ -150,31 +150,32 @@ def test_a_later_image_that_was_drawn_badly_leaves_the_others_their_noise(twins)
     assert sum(second) > 1.2 * sum(before)
 
 
-def mixture(objective, levels, **named):
-    """The objective whose driver's modes are believed to move by one of some levels."""
-    size = objective.parameters.n_coefficients
-    terms = tuple((level**2 * np.eye(size),) for level in levels)
-    block = Block("a", "wall", Acts.BOUNDARY, (0,), np.eye(size) / levels[0] ** 2, terms, (1.0, 1.0), **named)
-    parameters = replace(objective.parameters, blocks=(block,), nuisance_precision=np.eye(size))
-    return replace(objective, parameters=parameters)
-
-
-def test_an_alternative_stays_until_another_one_is_more_than_as_good(minimum):
+def test_an_alternative_stays_until_another_one_is_more_than_as_good(minimum, twins):
     objective, found = minimum
     size = float(np.sqrt(np.mean(found.unknowns[2:] ** 2)))
     for levels, chosen in (((size, 1.05 * size), 0), ((0.02 * size, size), 1)):
-        one = replace(mixture(objective, levels, odds=(0.0, 0.0)), chosen=(0,))
+        one = replace(twins.mixture(objective, levels), chosen=(0,))
         there = with_hyper_parameters(one, linear(one, found)(found.unknowns), found.unknowns)
         assert there.chosen == (chosen,)
 
 
-def test_what_is_learned_last_waits_until_it_is_asked_for(minimum):
+def test_what_is_learned_last_waits_until_it_is_asked_for(minimum, twins):
     objective, found = minimum
     size = float(np.sqrt(np.mean(found.unknowns[2:] ** 2)))
-    one = mixture(objective, (0.02 * size, size), odds=(0.0, 0.0), last=True)
+    one = twins.mixture(objective, (0.02 * size, size), last=True)
     here = linear(one, found)(found.unknowns)
     assert with_hyper_parameters(one, here, found.unknowns).chosen == (None,)
     assert with_hyper_parameters(replace(one, learn_last=True), here, found.unknowns).chosen == (1,)
+
+
+def test_a_field_varies_by_what_is_stated(minimum, twins):
+    """From the first iteration to the last: a floor under its variance would widen what is believed on the way."""
+    objective, found = minimum
+    size = float(np.sqrt(np.mean(found.unknowns[2:] ** 2)))
+    one = twins.mixture(objective, (size, 1.05 * size), acts=Acts.MATERIAL)
+    there = with_hyper_parameters(one, linear(one, found)(found.unknowns), found.unknowns)
+    assert there.chosen == (0,)
+    assert there.parameters.nuisance_precision == pytest.approx(one.parameters.blocks[0].precision)
 
 
 def two_causes(objective, found, *, levels, odds, rivals=()):

@@ -60,6 +60,18 @@ def test_the_way_to_the_estimate_does_not_show(twins, voxels, found, ratio):
     assert scales[0] == pytest.approx(scales[1], rel=5e-3)
 
 
+def test_which_alternative_is_chosen_does_not_hang_on_the_way(twins, found):
+    """Of two that are nearly alike the likelier one, whichever was chosen before."""
+    coefficients, ends = found.minimum.unknowns[2:], list[tuple[int | None, ...]]()
+    size = float(np.sqrt(np.mean(coefficients**2)))
+    objective = twins.mixture(end_of(found).objective, (size, 1.05 * size))
+    for before in (0, 1):
+        end = on(found, replace(objective, chosen=(before,)), twins, CHEAP)
+        assert end.minimum.converged
+        ends.append(end.objective.chosen)
+    assert ends[0] == ends[1]
+
+
 def test_no_accepted_step_raises_the_objective(twins, twin, voxels):
     """But for the noise of closest points; all of them together lower it."""
     objective = with_first_noise(twins.objective_of(voxels, twin.coefficients))

@@ -353,7 +353,8 @@ def _most_evident(
     terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: Block, odds: float
 ) -> tuple[float, NDArray[np.float64]]:
     """The largest log-evidence, with its log prior odds, of a family of priors of a block; its covariance (n, n)."""
-    floored = [term + LEAST_VARIANCE * np.eye(len(term)) for term in terms]
+    floor = 0.0 if block.acts is Acts.MATERIAL else LEAST_VARIANCE  # no mode of a field is forbidden, nor its size open
+    floored = [term + floor * np.eye(len(term)) for term in terms]
     evidence = seen.log_evidence(floored)
 
     def worse(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -169,7 +169,7 @@ def minimised(
     begin = replace(start.minimum, history=(first,), outcome=Outcome.STEPS)
     now = replace(start, minimum=begin, totals=(), correlated=0)
     del start
-    region = TrustRegion()
+    region, tried = TrustRegion(), set[tuple[int, ...]]()
     for number in range(1, rule.iterations + 1):
         line = f"{title}, iteration {number}"
         lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
@@ -178,13 +178,9 @@ def minimised(
         if now.minimum.outcome is Outcome.STUCK:
             break
         if now.convergence.converged:
-            wider = replace(now.objective, learn_last=True)
-            if now.objective.learn_last or not rule.learn or not any(b.last for b in wider.parameters.blocks):
-                now = replace(now, minimum=replace(now.minimum, outcome=Outcome.CONVERGED))
-                break
-            learned = with_hyper_parameters(wider, now.minimum.evaluation, now.minimum.unknowns)
-            now = replace(now, objective=wider)
-            if learned.chosen == wider.chosen:
+            tried.add(_numbers(now.objective))
+            now = _chosen_afresh(now) if rule.learn else now
+            if not rule.learn or _numbers(now.objective) in tried:
                 now = replace(now, minimum=replace(now.minimum, outcome=Outcome.CONVERGED))
                 break
     return now
@@ -230,6 +226,24 @@ def _iteration(
         raise failure
     spent = before.evaluations + trial_evaluations
     return replace(now, minimum=replace(before, outcome=Outcome.STUCK, evaluations=spent)), region
+
+
+def _chosen_afresh(now: OuterIterate) -> OuterIterate:
+    """With the blocks' alternatives as they are chosen where an iteration has ended, all blocks having their choice.
+
+    On the way an alternative stays until another one is more than as good, so that it hangs on where that began.
+    """
+    at, begin = now.minimum, replace(now.objective, learn_last=True, chosen=())
+    learned = with_hyper_parameters(begin, at.evaluation, at.unknowns)
+    if _numbers(learned) == _numbers(now.objective):
+        return now
+    evaluation = LinearisedObjective(learned, at.unknowns, at.evaluation)(at.unknowns)
+    return replace(now, objective=learned, minimum=replace(at, evaluation=evaluation))
+
+
+def _numbers(objective: Objective) -> tuple[int, ...]:
+    """Those of the alternatives chosen for the blocks, 0 where a block has none, or no choice yet."""
+    return tuple(number or 0 for number in objective.chosen)
 
 
 def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, fixed: bool) -> _Step:
