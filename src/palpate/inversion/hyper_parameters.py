@@ -26,7 +26,7 @@ from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns.blocks import Acts, Block
 
-LEAST_VARIANCE = 1e-3  # of a coefficient, times its variance under the block's own kernel: no mode is forbidden
+LEAST_VARIANCE = 1e-3  # of a coefficient of a motion, in its unit: no mode is forbidden
 FITTED = 0.5  # of a kind's residuals, the largest share that is taken for fitted by the unknowns
 
 LogEvidence = Callable[[NDArray[np.float64]], tuple[float, NDArray[np.float64]]]
@@ -353,7 +353,7 @@ def _most_evident(
     terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: Block, odds: float
 ) -> tuple[float, NDArray[np.float64]]:
     """The largest log-evidence, with its log prior odds, of a family of priors of a block; its covariance (n, n)."""
-    floor = 0.0 if block.acts is Acts.MATERIAL else LEAST_VARIANCE  # no mode of a field is forbidden, nor its size open
+    floor = 0.0 if block.acts is Acts.MATERIAL else LEAST_VARIANCE  # a field's levels leave no mode without variance
     floored = [term + floor * np.eye(len(term)) for term in terms]
     evidence = seen.log_evidence(floored)
 
