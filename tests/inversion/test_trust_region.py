@@ -23,7 +23,7 @@ from palpate.inversion import (
     trust_region,
     with_first_noise,
 )
-from palpate.inversion.optimise import RADIUS, TRIALS
+from palpate.inversion.optimise import RADIUS, TRIALS, TrustRegion, newton_decrement
 from palpate.inversion.trust_region import Convergence, Criterion
 
 CHEAP = StopRule(model_error=np.inf, derivatives=False)
@@ -121,6 +121,19 @@ def test_where_the_trust_region_cuts_a_step_short_no_hyper_parameter_moves(twins
     assert one.minimum.outcome is Outcome.STEPS
     end = minimised(start, settings.bounds, StopRule(), progress=twins.silent, title="")
     assert end.minimum.unknowns[:2] == pytest.approx(twins.TRUTH, abs=1e-4)
+
+
+def test_a_step_that_the_trust_region_cuts_ends_no_estimate(twins, found, monkeypatch):
+    """It is short for another reason than that the minimum is near: 0.3 standard deviations, 15 tolerances, away."""
+    end, sd = end_of(found), posterior_sd(found.minimum, 2)
+    monkeypatch.setattr(trust_region, "TrustRegion", lambda: TrustRegion(radius=1e-3 * float(sd.min())))
+    away = end.minimum.unknowns + 0.3 * np.concatenate([sd, np.zeros(end.objective.parameters.n_coefficients)])
+    assert newton_decrement(end.objective(away)) < trust_region.NOISE
+    back = minimised(
+        begun(end.objective, away), twins.settings(0.5).bounds, StopRule(), progress=twins.silent, title=""
+    )
+    assert back.minimum.converged
+    assert moved(back.minimum, found.minimum) < 2.0
 
 
 @pytest.mark.parametrize("ratio", [0.5, 12.0])

@@ -142,8 +142,11 @@ def with_released(inversion: Inversion, settings: InversionSettings, *, progress
     causes = dict.fromkeys(block.cause for block in inversion.objective.parameters.blocks if block.released)
     if not best.minimum.converged or not causes:
         return None
-    objective, evaluation = best.objective.released(best.minimum.evaluation, best.minimum.unknowns)
-    start = replace(best, objective=objective, minimum=replace(best.minimum, evaluation=evaluation))
+    unknowns = best.minimum.unknowns
+    objective, evaluation = best.objective.released(best.minimum.evaluation, unknowns)
+    places = objective.linearisation_points(unknowns, evaluation)
+    near = [known.update(place) for known, place in zip(objective.approximations, places, strict=True)]
+    start = replace(begun(objective.under(near), unknowns), checks=best.checks)
     return minimised(start, settings.bounds, NEAR, progress=progress, title=f"with {' and '.join(causes)} free")
 
 

@@ -61,6 +61,15 @@ class Bounds:
         """Which of theta (n_parameters,) lie at a bound: what holds them there is the search, not the images."""
         return np.asarray((theta <= self.lower) | (theta >= self.upper))
 
+    def free(
+        self, unknowns: NDArray[np.float64], score: NDArray[np.float64], fixed: NDArray[np.bool_] | bool
+    ) -> NDArray[np.bool_]:
+        """Which unknowns (n,) may move: no log-modulus that is `fixed`, or that the score (n,) pulls out of a bound."""
+        n = len(self.lower)
+        theta, slope = unknowns[:n], score[:n]
+        still = ((theta <= self.lower) & (slope > 0.0)) | ((theta >= self.upper) & (slope < 0.0)) | fixed
+        return np.concatenate([~still, np.ones(len(unknowns) - n, dtype=bool)])
+
 
 @dataclass(frozen=True, slots=True)
 class Iterate:
@@ -161,13 +170,10 @@ def gauss_newton(
         if not np.isfinite(now.value):
             outcome = Outcome.NOT_FINITE
             break
-        theta, slope = unknowns[:n], now.score[:n]  # a log-modulus at a bound that pulls outwards stays
-        still = ((theta <= bounds.lower) & (slope > 0.0)) | ((theta >= bounds.upper) & (slope < 0.0)) | fixed
-        free = np.concatenate([~still, np.ones(len(unknowns) - n, dtype=bool)])
-        quadratic = _QuadraticModel.of(now, free, n)
+        quadratic = _QuadraticModel.of(now, bounds.free(unknowns, now.score, fixed), n)
         whole = quadratic.step()
         decrement = -0.5 * float(now.score @ whole)
-        history.append(Iterate(theta, now.value, now.misfit_mm2, decrement))
+        history.append(Iterate(unknowns[:n], now.value, now.misfit_mm2, decrement))
         if decrement < tolerance and np.all(np.abs(whole[:n]) < within):
             outcome = Outcome.CONVERGED
             break
@@ -221,6 +227,11 @@ def _search(
             return (trial, there, region.after(float(gain / promised), longest)), spent, True
         region = region.smaller(longest)
     return None, spent, solved
+
+
+def newton_step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> NDArray[np.float64]:
+    """-H^-1 s (n,) of the unknowns that are free (n,): the step to the minimum of the quadratic model, however long."""
+    return _QuadraticModel.of(now, free, n_parameters).step()
 
 
 def newton_decrement(now: Evaluation) -> float:

@@ -25,6 +25,7 @@ from palpate.inversion.optimise import (
     TrustRegion,
     gauss_newton,
     newton_decrement,
+    newton_step,
     posterior_sd,
 )
 from palpate.mechanics.forward import SolveCounts
@@ -33,7 +34,7 @@ from palpate.progress import silent
 
 NOISE = 0.5  # of the objective: that of closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
 INNER = 1e-4  # of the objective: decrement of a minimum on linear residuals, and change by hyper-parameters, that end
-SETTLES = 6  # iterations, after which numbers of independent residuals stay, and the trust region no longer grows
+SETTLES = 6  # times that numbers of independent residuals are taken anew, after which they stay
 LEAST_SD = 0.03  # of ln E, see `linearisation_error`
 
 
@@ -72,7 +73,8 @@ class StopRule:
     that is more; coefficients: the decrement a coefficient that may be left; model_error: share of the tolerance by
     which what the approximation misses may set it off, inf: none is asked for; derivatives: whether those that decide
     the moduli must be exact so near; learn: whether hyper-parameters are sought, too; correlate: whether the
-    numbers of independent residuals are taken anew; iterations: the largest number.
+    numbers of independent residuals are taken anew; iterations: the largest number, in the second half of which the
+    trust region grows no more, so that it does not come and go.
     """
 
     step_sd: float = 0.02
@@ -141,12 +143,13 @@ class _Step:
         """By how much J falls on a way from unknowns (n,) to where it is `judged`, and on linear residuals.
 
         By the scores at both ends, -1/2 (s + s')^T d: closest points that slide over voxels are noise of J, as large as
-        what moduli promise, that the score, by the Jacobians of smooth surfaces, does not have.
+        what moduli promise, that the score, by the Jacobians of smooth surfaces, does not have. Or by J itself, where
+        that falls by more: on a long way the score does not change evenly.
         """
         d = self.minimum.unknowns - unknowns
         ends = judged.score, self.minimum.evaluation.score
         gain, promised = (-0.5 * float((self.begin.score + end) @ d) for end in ends)
-        return gain, promised
+        return max(gain, self.begin.value - judged.value), promised
 
 
 def minimised(
@@ -174,7 +177,7 @@ def minimised(
         line = f"{title}, iteration {number}"
         lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
         progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}{lowered}")
-        now, region = _iteration(now, bounds, rule, region, fixed, grows=number <= SETTLES)
+        now, region = _iteration(now, bounds, rule, region, fixed, grows=2 * number <= rule.iterations)
         if now.minimum.outcome is Outcome.STUCK:
             break
         if now.convergence.converged:
@@ -206,7 +209,7 @@ def _iteration(
         moved = np.abs(step.minimum.unknowns - before.unknowns)
         longest = float(np.max(moved[:n], initial=0.0))
         try:
-            there, judged, spent = _evaluated(step, now, rule)
+            there, judged, spent = _evaluated(step, now, bounds, rule, fixed)
         except NotConverged as error:
             failure, region = error, region.smaller(longest)
             continue
@@ -290,23 +293,25 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     return _Step(objective, found, begin, now, total, cut, settled)
 
 
-def _evaluated(step: _Step, now: OuterIterate, rule: StopRule) -> tuple[OuterIterate, Evaluation, int]:
+def _evaluated(
+    step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, fixed: bool
+) -> tuple[OuterIterate, Evaluation, int]:
     """The objective at the end of a step, its model made exact there where its error matters.
 
-    With it the evaluation by which the step is judged, on the model that it was made on, and the evaluations spent.
+    With it the evaluation by which the step is judged, on the model that it was made on, and the evaluations spent. A
+    step that the trust region cut tells by what is left of it at its end how far away the minimum is, not by its size.
     """
     n, unknowns = step.objective.n_parameters, step.minimum.unknowns
     objective = step.objective.rematched(unknowns)
     minimum, spent = replace(step.minimum, evaluation=objective(unknowns), outcome=Outcome.STEPS), 1
     tolerance = rule.tolerance(minimum, n)
-    moved = np.abs(unknowns - now.minimum.unknowns)[:n]
-    size = float(np.max(moved / tolerance, initial=0.0))
-    if step.cut and newton_decrement(now.minimum.evaluation) > NOISE:
-        size = max(size, 1.0)  # the trust region holds back what the noise of the objective does not hide
+    steps = [unknowns - now.minimum.unknowns]
+    if step.cut:
+        steps.append(newton_step(minimum.evaluation, bounds.free(unknowns, minimum.evaluation.score, fixed), n))
+    size = max(float(np.max(np.abs(d[:n]) / tolerance, initial=0.0)) for d in steps)
     wanted = size
     if np.isfinite(rule.coefficients):
-        step_taken = unknowns - now.minimum.unknowns
-        decrement = 0.5 * float(step_taken @ now.minimum.evaluation.matrix @ step_taken)
+        decrement = max(0.5 * float(d @ now.minimum.evaluation.matrix @ d) for d in steps)
         wanted = max(0.0 if np.isinf(rule.step_sd) else size, decrement / (rule.coefficients * len(unknowns)))
     correlated = now.correlated + step.settled
     if np.isinf(rule.model_error):
