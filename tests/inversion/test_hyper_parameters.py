@@ -113,7 +113,7 @@ def test_hyper_parameters_leave_the_old_objective_and_lower_the_objective(minimu
     """On linear residuals, and then the unknowns under them: each lowers J."""
     objective, found = minimum
     objective = with_correlations(objective, found.evaluation)
-    before = objective.value(found.unknowns)
+    before = objective(found.unknowns).value
     here = linear(objective, found)(found.unknowns)
     totals = [objective.total(here)]
     now, unknowns = objective, found.unknowns
@@ -123,7 +123,7 @@ def test_hyper_parameters_leave_the_old_objective_and_lower_the_objective(minimu
         totals.append(now.total(linear(now, found)(unknowns)))
     assert np.all(np.diff(totals) < 1e-3)  # weights of outliers are those of the step before
     assert totals[1] < totals[0]
-    assert objective.value(found.unknowns) == before
+    assert objective(found.unknowns).value == before
 
 
 def test_a_later_image_that_was_drawn_badly_leaves_the_others_their_noise(twins):

@@ -99,7 +99,7 @@ def test_the_score_of_the_objective_has_that_by_poissons_ratio(twin, point_motio
     objective = Objective((state.with_approximation(stands_in),), made.parameters).rematched(x)
     step = np.append([0.3, -0.2, 1.0], np.zeros(made.model.n_modes))
     h = 1e-4
-    slope = (objective.value(x + h * step) - objective.value(x - h * step)) / (2.0 * h)
+    slope = (objective(x + h * step).value - objective(x - h * step).value) / (2.0 * h)
     assert objective(x).score @ step == pytest.approx(slope, rel=1e-5)
     assert abs(objective(x).score[2]) > max(1.0, 0.01 * abs(slope))
 

@@ -123,6 +123,22 @@ def test_where_the_trust_region_cuts_a_step_short_no_hyper_parameter_moves(twins
     assert end.minimum.unknowns[:2] == pytest.approx(twins.TRUTH, abs=1e-4)
 
 
+def test_a_step_promises_by_the_scores_and_gains_by_them_or_by_the_objective_itself(found):
+    """A score that changes unevenly along a long way tells too little; the objective itself, where it is rough."""
+    end = end_of(found)
+    here, n = end.minimum.unknowns, end.objective.parameters.n_coefficients
+    unknowns = here + 4.0 * np.concatenate([posterior_sd(found.minimum, 2), np.zeros(n)])
+    linear = LinearisedObjective(end.objective, unknowns, end.objective(unknowns))
+    begin, reached = linear(unknowns), linear(here)
+    step = trust_region._Step(end.objective, replace(end.minimum, evaluation=reached), begin, 0.0, 0.0, False, False)
+    gain, promised = step.reductions(unknowns, reached)
+    assert gain == pytest.approx(promised)
+    steeper = replace(reached, score=3.0 * np.abs(begin.score) * np.sign(here - unknowns))
+    assert step.reductions(unknowns, steeper)[0] == pytest.approx(begin.value - reached.value)
+    higher = replace(reached, value=begin.value + 1.0)
+    assert step.reductions(unknowns, higher) == pytest.approx((promised, promised))
+
+
 def test_a_step_that_the_trust_region_cuts_ends_no_estimate(twins, found, monkeypatch):
     """It is short for another reason than that the minimum is near: 0.3 standard deviations, 15 tolerances, away."""
     end, sd = end_of(found), posterior_sd(found.minimum, 2)
@@ -322,7 +338,7 @@ def test_derivatives_that_are_exact_nowhere_leave_everything_open(found):
 
 def test_another_start_leaves_the_first_objective_as_it_was(twins, twin, voxels):
     objective = twins.objective_of(voxels, twin.coefficients)
-    before = objective.rematched(twin.unknowns).value(twin.unknowns)
+    before = objective.rematched(twin.unknowns)(twin.unknowns).value
     minimised(begun(objective, twin.unknowns), twins.settings(1.0).bounds, CHEAP, progress=twins.silent, title="")
     assert isinstance(objective, Objective)
-    assert objective.rematched(twin.unknowns).value(twin.unknowns) == before
+    assert objective.rematched(twin.unknowns)(twin.unknowns).value == before

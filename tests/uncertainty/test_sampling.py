@@ -70,7 +70,7 @@ def test_chains_have_the_covariance_that_is_asked_and_agree_with_each_other(obje
     within, between = theta.std(axis=1).mean(axis=0), theta.mean(axis=1).std(axis=0)
     assert np.all(between < 0.25 * within)
     assert np.all((found.accepted > 0.5) & (found.accepted <= 1.0))
-    below = -objective.value(minimum) - found.log_density  # half of chi-squared with as many degrees as unknowns
+    below = -objective(minimum).value - found.log_density  # half of chi-squared with as many degrees as unknowns
     assert below.shape == (4, 500)
     assert below.mean() == pytest.approx(0.5 * len(minimum), rel=0.15)
 

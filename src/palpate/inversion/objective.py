@@ -213,14 +213,6 @@ class Objective:
         states = [state.with_observations([next(left) for _ in state.observations]) for state in self.states]
         return replace(self, states=tuple(states))
 
-    def value(self, unknowns: NDArray[np.float64]) -> float:
-        """J alone at unknowns (n_unknowns,), for trial steps."""
-        total, _ = _prior(self.parameters, unknowns)
-        for s in range(len(self.states)):
-            pairs = self._residuals(s, self._equilibrium(s, unknowns).values, unknowns)
-            total += sum(mapped(lambda of: 0.5 * of[0].weighting.precision * _mean_loss(*of), pairs))
-        return total
-
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J with score, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
         lines = [line for s in range(len(self.states)) for line in self._linearised(s, unknowns)]
