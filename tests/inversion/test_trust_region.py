@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from itertools import count
 
 import numpy as np
 import pytest
@@ -70,6 +71,16 @@ def test_which_alternative_is_chosen_does_not_hang_on_the_way(twins, found):
         assert end.minimum.converged
         ends.append(end.objective.chosen)
     assert len(set(ends)) == 1
+
+
+def test_alternatives_that_lead_to_others_without_end_leave_the_last_minimum(twins, found, monkeypatch):
+    chosen_afresh, number = trust_region._chosen_afresh, count(1)
+    anew = lambda now: replace(chosen_afresh(now), objective=replace(now.objective, chosen=(next(number),)))  # noqa: E731
+    monkeypatch.setattr(trust_region, "_chosen_afresh", anew)
+    end = on(found, found.objective, twins, replace(StopRule(), iterations=6))
+    assert end.minimum.converged
+    assert next(number) > 2
+    assert moved(end.minimum, found.minimum) < 1.0
 
 
 def test_no_accepted_step_raises_the_objective(twins, twin, voxels):

@@ -74,7 +74,7 @@ class StopRule:
     which what the approximation misses may set it off, inf: none is asked for; derivatives: whether those that decide
     the moduli must be exact so near; learn: whether hyper-parameters are sought, too; correlate: whether the
     numbers of independent residuals are taken anew; iterations: the largest number, in the second half of which the
-    trust region grows no more, so that it does not come and go.
+    trust region grows no more and no alternative is chosen anew, so that none comes and goes.
     """
 
     step_sd: float = 0.02
@@ -174,16 +174,16 @@ def minimised(
     del start
     region, tried = TrustRegion(), set[tuple[int, ...]]()
     for number in range(1, rule.iterations + 1):
-        line = f"{title}, iteration {number}"
+        line, early = f"{title}, iteration {number}", 2 * number <= rule.iterations
         lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
         progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}{lowered}")
-        now, region = _iteration(now, bounds, rule, region, fixed, grows=2 * number <= rule.iterations)
+        now, region = _iteration(now, bounds, rule, region, fixed, grows=early)
         if now.minimum.outcome is Outcome.STUCK:
             break
         if now.convergence.converged:
             tried.add(_numbers(now.objective))
-            now = _chosen_afresh(now) if rule.learn else now
-            if not rule.learn or _numbers(now.objective) in tried:
+            now = _chosen_afresh(now) if rule.learn and early else now
+            if _numbers(now.objective) in tried:
                 now = replace(now, minimum=replace(now.minimum, outcome=Outcome.CONVERGED))
                 break
     return now
