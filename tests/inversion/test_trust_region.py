@@ -75,7 +75,10 @@ def test_which_alternative_is_chosen_does_not_hang_on_the_way(twins, found):
 
 def test_alternatives_that_lead_to_others_without_end_leave_the_last_minimum(twins, found, monkeypatch):
     chosen_afresh, number = trust_region._chosen_afresh, count(1)
-    anew = lambda now: replace(chosen_afresh(now), objective=replace(now.objective, chosen=(next(number),)))  # noqa: E731
+
+    def anew(now):
+        return replace(chosen_afresh(now), objective=replace(now.objective, chosen=(next(number),)))
+
     monkeypatch.setattr(trust_region, "_chosen_afresh", anew)
     end = on(found, found.objective, twins, replace(StopRule(), iterations=6))
     assert end.minimum.converged
