@@ -64,7 +64,10 @@ class Bounds:
     def free(
         self, unknowns: NDArray[np.float64], score: NDArray[np.float64], fixed: NDArray[np.bool_] | bool
     ) -> NDArray[np.bool_]:
-        """Which unknowns (n,) may move: no log-modulus that is `fixed`, or that the score (n,) pulls out of a bound."""
+        """Which unknowns (n,) may move: no log-modulus that is `fixed`, or that the score (n,) pulls out of a bound.
+
+        fixed: which log-moduli (n_parameters,) are, or whether all.
+        """
         n = len(self.lower)
         theta, slope = unknowns[:n], score[:n]
         still = ((theta <= self.lower) & (slope > 0.0)) | ((theta >= self.upper) & (slope < 0.0)) | fixed
