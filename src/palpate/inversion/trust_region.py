@@ -203,11 +203,12 @@ def _iteration(
 ) -> tuple[OuterIterate, TrustRegion]:
     """One accepted step, or `STUCK` where none of some trials is; the region for the next, and whether it may grow."""
     n, before = now.objective.n_parameters, now.minimum
+    moduli = np.append(np.arange(n), now.objective.parameters.acting_on_moduli)
     failure, trial_evaluations = None, 0
     for _ in range(TRIALS):
         step = _linear_minimum(now, bounds, rule, region, fixed)
         moved = np.abs(step.minimum.unknowns - before.unknowns)
-        longest = float(np.max(moved[:n], initial=0.0))
+        longest = float(np.max(moved[moduli], initial=0.0))
         try:
             there, judged, spent = _evaluated(step, now, bounds, rule, fixed)
         except NotConverged as error:
@@ -261,27 +262,35 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     trusted = [state.approximation.trust_radius for state in objective.states if state.approximation]
     theta, reach = at.unknowns[:n], min([region.radius, *trusted])
     near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
-    damping = region.damping
-    linear = LinearisedObjective(objective, at.unknowns, at.evaluation, damping)
-    within = 0.05 * rule.tolerance(at, n)
-    found = gauss_newton(linear, at.unknowns, bounds=near, fixed=fixed, tolerance=INNER, within=within)
-    found = found if not damping else replace(found, evaluation=replace(linear, damping=0.0)(found.unknowns))
-    theta = found.unknowns[:n]
+    damping, within = region.damping, 0.05 * rule.tolerance(at, n)
+
+    def least(linear: LinearisedObjective, begin: NDArray[np.float64]) -> Minimum:
+        """Its minimum, or a place on the straight way there where what else acts on moduli has gone far enough."""
+        found = gauss_newton(linear, begin, bounds=near, fixed=fixed, tolerance=INNER, within=within)
+        whole = found.unknowns - at.unknowns
+        share = reach / max(float(np.max(np.abs(whole[objective.parameters.acting_on_moduli]), initial=0.0)), reach)
+        if share == 1.0 and not linear.damping:
+            return found
+        unknowns = at.unknowns + share * whole if share < 1.0 else found.unknowns
+        return replace(found, unknowns=unknowns, evaluation=replace(linear, damping=0.0)(unknowns))
+
+    found = least(LinearisedObjective(objective, at.unknowns, at.evaluation, damping), at.unknowns)
+    theta, others = found.unknowns[:n], (found.unknowns - at.unknowns)[objective.parameters.acting_on_moduli]
     low, high = (theta <= near.lower) & (near.lower > bounds.lower), (theta >= near.upper) & (near.upper < bounds.upper)
-    cut = damping > 0.0 or (not fixed and bool(np.any(low | high)))
+    cut = damping > 0.0 or (not fixed and bool(np.any(low | high))) or bool(np.any(np.abs(others) > 0.999 * reach))
     now, total = objective.total(at.evaluation), objective.total(found.evaluation)
     if damping or not rule.learn:
         return _Step(objective, found, at.evaluation, now, total, cut, settled=False)
     settled = not cut and bool(np.all(np.abs(found.unknowns - at.unknowns)[:n] < posterior_sd(found, n)))
     if rule.correlate and settled and start.correlated < SETTLES:
         objective = with_correlations(objective, found.evaluation)
-        found = replace(found, evaluation=replace(linear, objective=objective)(found.unknowns))
+        found = replace(found, evaluation=LinearisedObjective(objective, at.unknowns, at.evaluation)(found.unknowns))
         plain = LinearisedObjective(objective, found.unknowns, found.evaluation)
         now, total = objective.total(plain(at.unknowns)), objective.total(found.evaluation)
     for _ in range(rule.iterations):
         learned = with_hyper_parameters(objective, found.evaluation, found.unknowns)
         linear = LinearisedObjective(learned, found.unknowns, found.evaluation)
-        again = gauss_newton(linear, found.unknowns, bounds=near, fixed=fixed, tolerance=INNER, within=within)
+        again = least(linear, found.unknowns)
         lower = learned.total(again.evaluation)
         if lower > total:
             break
