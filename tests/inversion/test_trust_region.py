@@ -26,6 +26,7 @@ from palpate.inversion import (
 )
 from palpate.inversion.optimise import RADIUS, TRIALS, TrustRegion, newton_decrement
 from palpate.inversion.trust_region import Convergence, Criterion
+from palpate.unknowns import layer_blocks
 
 CHEAP = StopRule(model_error=np.inf, derivatives=False)
 
@@ -164,6 +165,32 @@ def test_a_step_that_the_trust_region_cuts_ends_no_estimate(twins, found, monkey
     )
     assert back.minimum.converged
     assert moved(back.minimum, found.minimum) < 2.0
+
+
+@pytest.mark.parametrize("radius", [0.02, 0.1])
+def test_no_step_of_what_acts_on_moduli_is_longer_than_the_trust_radius(twins, twin, found, monkeypatch, radius):
+    """A layer's stiffness leads as far from where the model is exact as a modulus does."""
+    tissues, regions = twin.scene.tissues, end_of(found).objective.states[0].model.regions
+    own = tuple(
+        i for i, number in enumerate(regions) if tissues[number].name == end_of(found).objective.parameters.tissues[0]
+    )
+    objective = end_of(found).objective
+    blocks = (*objective.parameters.blocks, *layer_blocks((("layer", own, 1.0),), (0,), sd=1.0, thickness_mm=0.5))
+    parameters = replace(objective.parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0))).released()
+    objective = replace(objective, parameters=parameters, chosen=())
+    away = np.append(found.minimum.unknowns, -1.0)
+    monkeypatch.setattr(trust_region, "TrustRegion", lambda: TrustRegion(radius=radius))
+    one = minimised(
+        begun(objective, away),
+        twins.settings(0.5).bounds,
+        replace(CHEAP, iterations=1),
+        progress=twins.silent,
+        title="",
+    )
+    moduli = np.append(np.arange(2), parameters.acting_on_moduli)
+    assert len(moduli) == 3
+    assert np.abs(one.minimum.unknowns - away)[moduli].max() == pytest.approx(radius, rel=1e-6)
+    assert Criterion.STEP in one.convergence.unmet
 
 
 @pytest.mark.parametrize("ratio", [0.5, 12.0])

@@ -69,10 +69,12 @@ def vertex_normals(points: NDArray[np.float64], triangles: NDArray[np.int64]) ->
     """Unit normals (n_nodes, 3) at nodes (n_nodes, 3) mm, those of their triangles (n_faces, 3) weighted by angle.
 
     How a surface is cut into triangles then changes nothing (Thuermer & Wuethrich 1998, Journal of Graphics Tools 3(1),
-    43-46); by area the normal leans towards the largest, and a wall that turns in itself seems to move outwards.
+    43-46); by area the normal leans towards the largest, and a wall that turns in itself seems to move outwards. 0 at
+    nodes of no triangle.
     """
     weighting = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
-    return np.asarray(igl.per_vertex_normals(np.ascontiguousarray(points), np.ascontiguousarray(triangles), weighting))
+    found = igl.per_vertex_normals(np.ascontiguousarray(points), np.ascontiguousarray(triangles), weighting)
+    return np.nan_to_num(found)
 
 
 MISSING = -9
