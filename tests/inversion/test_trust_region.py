@@ -87,6 +87,55 @@ def test_alternatives_that_lead_to_others_without_end_leave_the_last_minimum(twi
     assert moved(end.minimum, found.minimum) < 1.0
 
 
+def test_a_minimum_is_not_lost_by_alternatives_that_lead_to_none(twins, found, monkeypatch):
+    """What is chosen afresh lies far away, and the iterations end before it is a minimum."""
+
+    def far(now):
+        sd = posterior_sd(now.minimum, 2)
+        away = now.minimum.unknowns + 5.0 * np.concatenate([sd, np.zeros(now.objective.parameters.n_coefficients)])
+        return replace(begun(replace(now.objective, chosen=(7,)), away), totals=now.totals)
+
+    monkeypatch.setattr(trust_region, "_chosen_afresh", far)
+    end = on(found, found.objective, twins, replace(StopRule(), iterations=2))
+    assert end.minimum.outcome is Outcome.CONVERGED
+    assert moved(end.minimum, found.minimum) < 1.0
+
+
+def test_of_minima_under_other_alternatives_the_likeliest_is_told_whatever_their_order(found):
+    end = end_of(found)
+    worse = end.minimum.unknowns + 3.0 * posterior_sd(found.minimum, 2)[0] * np.eye(len(end.minimum.unknowns))[0]
+    other = begun(end.objective, worse)
+    for ends in ((end, other), (other, end)):
+        assert np.array_equal(trust_region._likeliest(ends, ends[-1]).minimum.unknowns, end.minimum.unknowns)
+        assert trust_region._likeliest(ends, ends[-1]).minimum.evaluations == ends[-1].minimum.evaluations
+
+
+def test_hyper_parameters_stay_where_the_objective_rises_by_what_was_promised_of_others(
+    twins, twin, voxels, monkeypatch
+):
+    """Residuals that are linear promise of them what does not hold where these lead: the step is taken without."""
+    start = begun(
+        with_first_noise(twins.objective_of(voxels, twin.coefficients)), np.append([0.0, 0.0], twin.coefficients)
+    )
+    evaluated = trust_region._evaluated
+
+    def rises(step, *of):
+        there, judged, spent = evaluated(step, *of)
+        same = [o.weighting.sd for o in step.objective.observations] == scales
+        return there, judged if same else replace(judged, value=judged.value + 100.0), spent
+
+    scales = [o.weighting.sd for o in start.objective.observations]
+    one = replace(CHEAP, iterations=1)
+    bounds = twins.settings(1.0).bounds
+    assert [
+        o.weighting.sd for o in minimised(start, bounds, one, progress=twins.silent, title="").objective.observations
+    ] != scales
+    monkeypatch.setattr(trust_region, "_evaluated", rises)
+    end = minimised(start, bounds, one, progress=twins.silent, title="")
+    assert [o.weighting.sd for o in end.objective.observations] == scales
+    assert np.abs(end.minimum.unknowns - start.minimum.unknowns)[:2].max() > 0.0
+
+
 def test_no_accepted_step_raises_the_objective(twins, twin, voxels):
     """But for the noise of closest points; all of them together lower it."""
     objective = with_first_noise(twins.objective_of(voxels, twin.coefficients))

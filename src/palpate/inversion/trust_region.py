@@ -5,7 +5,7 @@ It is the same for the linear and for a finite-strain law, and for every approxi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
 from palpate.inversion.hyper_parameters import with_correlations, with_hyper_parameters
-from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
+from palpate.inversion.objective import AS_GOOD, Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
     BAD,
     TRIALS,
@@ -172,7 +172,7 @@ def minimised(
     begin = replace(start.minimum, history=(first,), outcome=Outcome.STEPS)
     now = replace(start, minimum=begin, totals=(), correlated=0)
     del start
-    region, tried = TrustRegion(), set[tuple[int, ...]]()
+    region, ends = TrustRegion(), list[OuterIterate]()
     for number in range(1, rule.iterations + 1):
         line, early = f"{title}, iteration {number}", 2 * number <= rule.iterations
         lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
@@ -181,12 +181,11 @@ def minimised(
         if now.minimum.outcome is Outcome.STUCK:
             break
         if now.convergence.converged:
-            tried.add(_numbers(now.objective))
+            ends.append(replace(now, minimum=replace(now.minimum, outcome=Outcome.CONVERGED)))
             now = _chosen_afresh(now) if rule.learn and early else now
-            if _numbers(now.objective) in tried:
-                now = replace(now, minimum=replace(now.minimum, outcome=Outcome.CONVERGED))
+            if _numbers(now.objective) in [_numbers(end.objective) for end in ends]:
                 break
-    return now
+    return _likeliest(ends, now) if ends else now
 
 
 def fit_coefficients(objective: Objective, begin: NDArray[np.float64], *, bounds: Bounds) -> Minimum:
@@ -216,6 +215,9 @@ def _iteration(
             continue
         failure, trial_evaluations = None, trial_evaluations + spent
         then = step.then + judged.value - step.minimum.evaluation.value
+        if rule.learn and then - step.now > AS_GOOD:  # what residuals promised of other hyper-parameters does not hold
+            rule = replace(rule, learn=False)
+            continue
         gain, promised = step.reductions(before.unknowns, judged)
         if (gain + NOISE) / (promised + NOISE) > BAD:
             region = region.after(gain / max(promised, 1e-9), longest, grows=grows)
@@ -243,6 +245,27 @@ def _chosen_afresh(now: OuterIterate) -> OuterIterate:
         return now
     evaluation = LinearisedObjective(learned, at.unknowns, at.evaluation)(at.unknowns)
     return replace(now, objective=learned, minimum=replace(at, evaluation=evaluation))
+
+
+def _likeliest(ends: Sequence[OuterIterate], last: OuterIterate) -> OuterIterate:
+    """Of minima under other alternatives that with the least J, by the numbers of independent residuals of the last.
+
+    The cost is that of all, up to the `last` iteration.
+    """
+    observations = ends[-1].objective.observations
+
+    def alike(end: OuterIterate) -> float:
+        """J with these numbers, of the same residuals."""
+        pairs = zip(end.objective.observations, observations, strict=True)
+        objective = end.objective.with_observations([o.with_correlation(k.noise_model) for o, k in pairs])
+        at = end.minimum
+        return objective.total(LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns))
+
+    best = ends[0] if len(ends) == 1 else min(ends, key=alike)
+    if best.minimum.evaluations == last.minimum.evaluations:
+        return best
+    spent = last.counts - replace(best, checks=SolveCounts()).counts
+    return replace(best, minimum=replace(best.minimum, evaluations=last.minimum.evaluations), checks=spent)
 
 
 def _numbers(objective: Objective) -> tuple[int, ...]:

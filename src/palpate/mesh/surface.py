@@ -74,7 +74,7 @@ def vertex_normals(points: NDArray[np.float64], triangles: NDArray[np.int64]) ->
     """
     weighting = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
     found = igl.per_vertex_normals(np.ascontiguousarray(points), np.ascontiguousarray(triangles), weighting)
-    return np.nan_to_num(found)
+    return np.asarray(np.nan_to_num(found))
 
 
 MISSING = -9
