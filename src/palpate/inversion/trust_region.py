@@ -35,6 +35,7 @@ from palpate.progress import silent
 NOISE = 0.5  # of the objective: that of closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
 INNER = 1e-4  # of the objective: decrement of a minimum on linear residuals, and change by hyper-parameters, that end
 SETTLES = 6  # times that numbers of independent residuals are taken anew, after which they stay
+TRIED = 4  # iterations under alternatives that were chosen afresh, after which J must be lower than before
 LEAST_SD = 0.03  # of ln E, see `linearisation_error`
 
 
@@ -139,17 +140,17 @@ class _Step:
     cut: bool
     settled: bool
 
-    def reductions(self, unknowns: NDArray[np.float64], judged: Evaluation) -> tuple[float, float]:
-        """By how much J falls on a way from unknowns (n,) to where it is `judged`, and on linear residuals.
+    def reductions(self, unknowns: NDArray[np.float64], there: Evaluation) -> tuple[float, float]:
+        """By how much J falls on a way from unknowns (n,) to where it is evaluated, and on linear residuals.
 
         By the scores at both ends, -1/2 (s + s')^T d: closest points that slide over voxels are noise of J, as large as
         what moduli promise, that the score, by the Jacobians of smooth surfaces, does not have. Or by J itself, where
         that falls by more: on a long way the score does not change evenly.
         """
         d = self.minimum.unknowns - unknowns
-        ends = judged.score, self.minimum.evaluation.score
+        ends = there.score, self.minimum.evaluation.score
         gain, promised = (-0.5 * float((self.begin.score + end) @ d) for end in ends)
-        return max(gain, self.begin.value - judged.value), promised
+        return max(gain, self.begin.value - there.value), promised
 
 
 def minimised(
@@ -172,7 +173,7 @@ def minimised(
     begin = replace(start.minimum, history=(first,), outcome=Outcome.STEPS)
     now = replace(start, minimum=begin, totals=(), correlated=0)
     del start
-    region, ends = TrustRegion(), list[OuterIterate]()
+    region, ends, anew = TrustRegion(), list[OuterIterate](), 0
     for number in range(1, rule.iterations + 1):
         line, early = f"{title}, iteration {number}", 2 * number <= rule.iterations
         lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
@@ -180,7 +181,10 @@ def minimised(
         now, region = _iteration(now, bounds, rule, region, fixed, grows=early)
         if now.minimum.outcome is Outcome.STUCK:
             break
+        if ends and number == anew + TRIED and _likeliest((ends[-1], now), now).minimum.converged:
+            break
         if now.convergence.converged:
+            anew = number
             ends.append(replace(now, minimum=replace(now.minimum, outcome=Outcome.CONVERGED)))
             now = _chosen_afresh(now) if rule.learn and early else now
             if _numbers(now.objective) in [_numbers(end.objective) for end in ends]:
@@ -209,25 +213,26 @@ def _iteration(
         moved = np.abs(step.minimum.unknowns - before.unknowns)
         longest = float(np.max(moved[moduli], initial=0.0))
         try:
-            there, judged, spent = _evaluated(step, now, bounds, rule, fixed)
+            there, spent = _evaluated(step, now, bounds, rule, fixed)
         except NotConverged as error:
             failure, region = error, region.smaller(longest)
             continue
         failure, trial_evaluations = None, trial_evaluations + spent
-        then = step.then + judged.value - step.minimum.evaluation.value
-        if rule.learn and then - step.now > AS_GOOD:  # what residuals promised of other hyper-parameters does not hold
-            rule = replace(rule, learn=False)
-            continue
-        gain, promised = step.reductions(before.unknowns, judged)
-        if (gain + NOISE) / (promised + NOISE) > BAD:
+        seen = there.minimum.evaluation
+        then = step.then + seen.value - step.minimum.evaluation.value
+        gain, promised = step.reductions(before.unknowns, seen)
+        anew = bool(now.objective.chosen) and _numbers(step.objective) != _numbers(now.objective)
+        if (gain + NOISE) / (promised + NOISE) > BAD and not (anew and then - step.now > AS_GOOD):
             region = region.after(gain / max(promised, 1e-9), longest, grows=grows)
-            end = there.minimum
-            seen, spent = end.evaluation, before.evaluations + trial_evaluations
+            end, spent = there.minimum, before.evaluations + trial_evaluations
             arrived = Iterate(end.unknowns[:n], seen.value, seen.misfit_mm2, newton_decrement(seen))
             end = replace(end, history=(*before.history, arrived), evaluations=spent)
             totals = (*now.totals, (step.now, then))
             return replace(there, minimum=end, totals=totals), region
-        region = region.smaller(longest)
+        if anew:  # what linear residuals promised of other alternatives does not hold where they lead
+            rule = replace(rule, learn=False)
+        else:
+            region = region.smaller(longest)
     if failure is not None:
         raise failure
     spent = before.evaluations + trial_evaluations
@@ -325,13 +330,11 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     return _Step(objective, found, begin, now, total, cut, settled)
 
 
-def _evaluated(
-    step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, fixed: bool
-) -> tuple[OuterIterate, Evaluation, int]:
-    """The objective at the end of a step, its model made exact there where its error matters.
+def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, fixed: bool) -> tuple[OuterIterate, int]:
+    """The objective at the end of a step, its model made exact there where its error matters; the evaluations spent.
 
-    With it the evaluation by which the step is judged, on the model that it was made on, and the evaluations spent. A
-    step that the trust region cut tells by what is left of it at its end how far away the minimum is, not by its size.
+    A step that the trust region cut tells by what is left of it at its end how far away the minimum is, not by its
+    size.
     """
     n, unknowns = step.objective.n_parameters, step.minimum.unknowns
     objective = step.objective.rematched(unknowns)
@@ -348,9 +351,9 @@ def _evaluated(
     correlated = now.correlated + step.settled
     if np.isinf(rule.model_error):
         there = OuterIterate(objective, minimum, Convergence(wanted, 0.0, 0.0), now.checks, now.totals)
-        return replace(there, correlated=correlated), minimum.evaluation, spent
+        return replace(there, correlated=correlated), spent
     left = float(np.max(linearisation_error(objective, minimum) / tolerance, initial=0.0)) if rule.derivatives else 0.0
-    checks, judged, missing = now.checks, minimum.evaluation, np.inf
+    checks, missing = now.checks, np.inf
     if left < 1.0:  # else it is made exact in any case
         _, off, cost = model_error(objective, minimum)
         checks, missing = checks + cost, float(np.max(off / (rule.model_error * tolerance), initial=0.0))
@@ -360,7 +363,7 @@ def _evaluated(
         objective = objective.under([approximation.update(place) for approximation, place in pairs])
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
     there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals)
-    return replace(there, correlated=correlated), judged, spent
+    return replace(there, correlated=correlated), spent
 
 
 def linearisation_error(objective: Objective, there: Minimum) -> NDArray[np.float64]:
