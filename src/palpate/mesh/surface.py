@@ -66,21 +66,10 @@ def triangle_normals(points: NDArray[np.float64], triangles: NDArray[np.int64]) 
 
 
 def vertex_normals(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Unit normals (n_nodes, 3) at nodes (n_nodes, 3) mm, those of their triangles (n_faces, 3) weighted by angle.
-
-    How a surface is cut into triangles then changes nothing (Thuermer & Wuethrich 1998, Journal of Graphics Tools 3(1),
-    43-46); by area the normal leans towards the largest, and a wall that turns in itself seems to move outwards. 0 at
-    nodes of no triangle.
-    """
-    corners = points[triangles]  # igl's own would end the process where somebody else's page names nodes that are not
-    sides = np.roll(corners, -1, axis=1) - corners  # each to the next corner
-    sides /= np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), 1e-30)
-    angles = np.arccos(np.clip(-np.einsum("tka,tka->tk", sides, np.roll(sides, 1, axis=1)), -1.0, 1.0))
+    """Unit normals (n_nodes, 3) at nodes (n_nodes, 3) mm, area-weighted over their triangles (n_faces, 3)."""
     faces = triangle_normals(points, triangles)
-    faces = faces / np.maximum(np.linalg.norm(faces, axis=1, keepdims=True), 1e-30)
-    weighed = angles[:, :, None] * faces[:, None]
-    columns = [np.bincount(triangles.ravel(), weighed[..., a].ravel(), minlength=len(points)) for a in range(3)]
-    summed = np.stack(columns, axis=1)
+    columns = [np.bincount(triangles.ravel(), np.repeat(faces[:, a], 3), minlength=len(points)) for a in range(3)]
+    summed = np.stack(columns, axis=1).astype(np.float64)
     return np.asarray(summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-30))
 
 
