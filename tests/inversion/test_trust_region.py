@@ -87,17 +87,36 @@ def test_alternatives_that_lead_to_others_without_end_leave_the_last_minimum(twi
     assert moved(end.minimum, found.minimum) < 1.0
 
 
+def far_away(now):
+    """Five standard deviations off, under an alternative that no block has had."""
+    sd = posterior_sd(now.minimum, 2)
+    away = now.minimum.unknowns + 5.0 * np.concatenate([sd, np.zeros(now.objective.parameters.n_coefficients)])
+    return replace(begun(replace(now.objective, chosen=(7,)), away), totals=now.totals)
+
+
 def test_a_minimum_is_not_lost_by_alternatives_that_lead_to_none(twins, found, monkeypatch):
     """What is chosen afresh lies far away, and the iterations end before it is a minimum."""
 
-    def far(now):
-        sd = posterior_sd(now.minimum, 2)
-        away = now.minimum.unknowns + 5.0 * np.concatenate([sd, np.zeros(now.objective.parameters.n_coefficients)])
-        return replace(begun(replace(now.objective, chosen=(7,)), away), totals=now.totals)
-
-    monkeypatch.setattr(trust_region, "_chosen_afresh", far)
+    monkeypatch.setattr(trust_region, "_chosen_afresh", far_away)
     end = on(found, found.objective, twins, replace(StopRule(), iterations=2))
     assert end.minimum.outcome is Outcome.CONVERGED
+    assert moved(end.minimum, found.minimum) < 1.0
+
+
+def test_alternatives_that_do_not_lower_the_objective_in_some_iterations_are_given_up(twins, found, monkeypatch):
+    """As where a step far away brings ever more, and the minimum that was found is likelier."""
+    iteration, numbers = trust_region._iteration, count(1)
+
+    def without_end(now, bounds, rule, region, *others, **named):
+        if next(numbers) == 1:
+            return iteration(now, bounds, rule, region, *others, **named)
+        return replace(now, convergence=Convergence(step=9.0)), region
+
+    monkeypatch.setattr(trust_region, "_iteration", without_end)
+    monkeypatch.setattr(trust_region, "_chosen_afresh", far_away)
+    end = on(found, found.objective, twins)
+    assert next(numbers) == 1 + trust_region.TRIED + 1
+    assert end.minimum.converged
     assert moved(end.minimum, found.minimum) < 1.0
 
 

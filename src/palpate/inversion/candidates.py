@@ -115,9 +115,8 @@ def compared(distinct: Sequence[OuterIterate], bounds: Bounds) -> tuple[list[flo
     reference = next((iterate for iterate in distinct if iterate.minimum.converged), distinct[0]).objective
     values, evaluations = [], 0
     for iterate in distinct:
-        pairs = zip(iterate.objective.observations, reference.observations, strict=True)
-        same = iterate.objective.with_observations([o.with_correlation(r.noise_model) for o, r in pairs])
-        end = minimised(begun(same, iterate.minimum.unknowns), bounds, COMPARED, progress=silent, title="compared")
+        begin = begun(iterate.objective.counted_as(reference), iterate.minimum.unknowns)
+        end = minimised(begin, bounds, COMPARED, progress=silent, title="compared")
         values.append(end.objective.total(end.minimum.evaluation))
         evaluations += end.minimum.evaluations
     return values, evaluations

@@ -213,6 +213,11 @@ class Objective:
         states = [state.with_observations([next(left) for _ in state.observations]) for state in self.states]
         return replace(self, states=tuple(states))
 
+    def counted_as(self, other: Objective) -> Objective:
+        """The same with the numbers of independent residuals of another one, under which both may be compared."""
+        pairs = zip(self.observations, other.observations, strict=True)
+        return self.with_observations([mine.with_correlation(theirs.noise_model) for mine, theirs in pairs])
+
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J with score, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
         lines = [line for s in range(len(self.states)) for line in self._linearised(s, unknowns)]

@@ -35,7 +35,7 @@ from palpate.progress import silent
 NOISE = 0.5  # of the objective: that of closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
 INNER = 1e-4  # of the objective: decrement of a minimum on linear residuals, and change by hyper-parameters, that end
 SETTLES = 6  # times that numbers of independent residuals are taken anew, after which they stay
-TRIED = 4  # iterations under alternatives that were chosen afresh, after which J must be lower than before
+TRIED = 4  # iterations under alternatives that were chosen afresh, after which J must be less than before
 LEAST_SD = 0.03  # of ln E, see `linearisation_error`
 
 
@@ -164,16 +164,17 @@ def minimised(
 ) -> OuterIterate:
     """Lower the objective from `start` until a stop rule is met.
 
-    fixed: whether the log-moduli stay. `title` begins each line of `progress`. The minimum's history is that of the
-    loop alone, its evaluations are added to those of `start`. Raises `NotConverged` when the full model has no
-    equilibrium where every trial leads.
+    Where it is met the blocks choose their alternatives afresh, and the loop goes on from there; of the minima that it
+    finds so the likeliest is told. fixed: whether the log-moduli stay. `title` begins each line of `progress`. The
+    minimum's history is that of the loop alone, its evaluations are added to those of `start`. Raises `NotConverged`
+    when the full model has no equilibrium where every trial leads.
     """
     at, n = start.minimum.evaluation, start.objective.n_parameters
     first = Iterate(start.minimum.unknowns[:n], at.value, at.misfit_mm2, newton_decrement(at))
     begin = replace(start.minimum, history=(first,), outcome=Outcome.STEPS)
     now = replace(start, minimum=begin, totals=(), correlated=0)
     del start
-    region, ends, anew = TrustRegion(), list[OuterIterate](), 0
+    region, ends, last = TrustRegion(), list[OuterIterate](), 0
     for number in range(1, rule.iterations + 1):
         line, early = f"{title}, iteration {number}", 2 * number <= rule.iterations
         lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
@@ -181,10 +182,10 @@ def minimised(
         now, region = _iteration(now, bounds, rule, region, fixed, grows=early)
         if now.minimum.outcome is Outcome.STUCK:
             break
-        if ends and number == anew + TRIED and _likeliest((ends[-1], now), now).minimum.converged:
+        if ends and number == last + TRIED and _total_counted_as(now, now) >= _total_counted_as(ends[-1], now):
             break
         if now.convergence.converged:
-            anew = number
+            last = number
             ends.append(replace(now, minimum=replace(now.minimum, outcome=Outcome.CONVERGED)))
             now = _chosen_afresh(now) if rule.learn and early else now
             if _numbers(now.objective) in [_numbers(end.objective) for end in ends]:
@@ -204,7 +205,11 @@ def fit_coefficients(objective: Objective, begin: NDArray[np.float64], *, bounds
 def _iteration(
     now: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, fixed: bool, *, grows: bool
 ) -> tuple[OuterIterate, TrustRegion]:
-    """One accepted step, or `STUCK` where none of some trials is; the region for the next, and whether it may grow."""
+    """One accepted step, or `STUCK` where none of some trials is; the region for the next, and whether it may grow.
+
+    A step that brings other alternatives is taken only where J does not rise by more than what is as good: else the
+    linear residuals promised of them what does not hold where they lead, and it is taken again without.
+    """
     n, before = now.objective.n_parameters, now.minimum
     moduli = np.append(np.arange(n), now.objective.parameters.acting_on_moduli)
     failure, trial_evaluations = None, 0
@@ -221,15 +226,15 @@ def _iteration(
         seen = there.minimum.evaluation
         then = step.then + seen.value - step.minimum.evaluation.value
         gain, promised = step.reductions(before.unknowns, seen)
-        anew = bool(now.objective.chosen) and _numbers(step.objective) != _numbers(now.objective)
-        if (gain + NOISE) / (promised + NOISE) > BAD and not (anew and then - step.now > AS_GOOD):
+        others = bool(now.objective.chosen) and _numbers(step.objective) != _numbers(now.objective)
+        if (gain + NOISE) / (promised + NOISE) > BAD and not (others and then - step.now > AS_GOOD):
             region = region.after(gain / max(promised, 1e-9), longest, grows=grows)
             end, spent = there.minimum, before.evaluations + trial_evaluations
             arrived = Iterate(end.unknowns[:n], seen.value, seen.misfit_mm2, newton_decrement(seen))
             end = replace(end, history=(*before.history, arrived), evaluations=spent)
             totals = (*now.totals, (step.now, then))
             return replace(there, minimum=end, totals=totals), region
-        if anew:  # what linear residuals promised of other alternatives does not hold where they lead
+        if others:
             rule = replace(rule, learn=False)
         else:
             region = region.smaller(longest)
@@ -257,20 +262,17 @@ def _likeliest(ends: Sequence[OuterIterate], last: OuterIterate) -> OuterIterate
 
     The cost is that of all, up to the `last` iteration.
     """
-    observations = ends[-1].objective.observations
-
-    def alike(end: OuterIterate) -> float:
-        """J with these numbers, of the same residuals."""
-        pairs = zip(end.objective.observations, observations, strict=True)
-        objective = end.objective.with_observations([o.with_correlation(k.noise_model) for o, k in pairs])
-        at = end.minimum
-        return objective.total(LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns))
-
-    best = ends[0] if len(ends) == 1 else min(ends, key=alike)
+    best = ends[0] if len(ends) == 1 else min(ends, key=lambda end: _total_counted_as(end, ends[-1]))
     if best.minimum.evaluations == last.minimum.evaluations:
         return best
     spent = last.counts - replace(best, checks=SolveCounts()).counts
     return replace(best, minimum=replace(best.minimum, evaluations=last.minimum.evaluations), checks=spent)
+
+
+def _total_counted_as(iterate: OuterIterate, other: OuterIterate) -> float:
+    """J where an iteration ended, with the numbers of independent residuals of another one."""
+    objective, at = iterate.objective.counted_as(other.objective), iterate.minimum
+    return objective.total(LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns))
 
 
 def _numbers(objective: Objective) -> tuple[int, ...]:
@@ -292,20 +294,21 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
     damping, within = region.damping, 0.05 * rule.tolerance(at, n)
 
-    def least(linear: LinearisedObjective, begin: NDArray[np.float64]) -> Minimum:
-        """Its minimum, or a place on the straight way there where what else acts on moduli has gone far enough."""
+    def least(linear: LinearisedObjective, begin: NDArray[np.float64]) -> tuple[Minimum, bool]:
+        """Its minimum, or how far on the straight way there what else acts on moduli may go; whether that is it."""
         found = gauss_newton(linear, begin, bounds=near, fixed=fixed, tolerance=INNER, within=within)
         whole = found.unknowns - at.unknowns
-        share = reach / max(float(np.max(np.abs(whole[objective.parameters.acting_on_moduli]), initial=0.0)), reach)
-        if share == 1.0 and not linear.damping:
-            return found
-        unknowns = at.unknowns + share * whole if share < 1.0 else found.unknowns
-        return replace(found, unknowns=unknowns, evaluation=replace(linear, damping=0.0)(unknowns))
+        furthest = float(np.max(np.abs(whole[objective.parameters.acting_on_moduli]), initial=0.0))
+        if furthest <= reach and not linear.damping:
+            return found, False
+        unknowns = at.unknowns + reach / furthest * whole if furthest > reach else found.unknowns
+        there = replace(found, unknowns=unknowns, evaluation=replace(linear, damping=0.0)(unknowns))
+        return there, furthest > reach
 
-    found = least(LinearisedObjective(objective, at.unknowns, at.evaluation, damping), at.unknowns)
-    theta, others = found.unknowns[:n], (found.unknowns - at.unknowns)[objective.parameters.acting_on_moduli]
+    found, shortened = least(LinearisedObjective(objective, at.unknowns, at.evaluation, damping), at.unknowns)
+    theta = found.unknowns[:n]
     low, high = (theta <= near.lower) & (near.lower > bounds.lower), (theta >= near.upper) & (near.upper < bounds.upper)
-    cut = damping > 0.0 or (not fixed and bool(np.any(low | high))) or bool(np.any(np.abs(others) > 0.999 * reach))
+    cut = damping > 0.0 or shortened or (not fixed and bool(np.any(low | high)))
     now, total = objective.total(at.evaluation), objective.total(found.evaluation)
     if damping or not rule.learn:
         return _Step(objective, found, at.evaluation, now, total, cut, settled=False)
@@ -318,12 +321,12 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     for _ in range(rule.iterations):
         learned = with_hyper_parameters(objective, found.evaluation, found.unknowns)
         linear = LinearisedObjective(learned, found.unknowns, found.evaluation)
-        again = least(linear, found.unknowns)
+        again, shortened = least(linear, found.unknowns)
         lower = learned.total(again.evaluation)
         if lower > total:
             break
         moved = np.abs(again.unknowns - found.unknowns)[:n] / rule.tolerance(again, n)
-        change, objective, found, total = total - lower, learned, again, lower
+        change, objective, found, total, cut = total - lower, learned, again, lower, cut or shortened
         if np.all(moved < 0.1) and change < INNER:
             break
     begin = LinearisedObjective(objective, found.unknowns, found.evaluation)(at.unknowns)
