@@ -11,7 +11,7 @@ import pytest
 from scipy import linalg
 
 from palpate.inversion import LaterState, Objective, hyper_parameters
-from palpate.observation.wall_modes import Wall, wall_modes, wall_of
+from palpate.observation.wall_modes import Wall, fine_modes, wall_modes, wall_of
 from palpate.unknowns import Acts, Block, ParameterMap, unit_blocks, wall_blocks
 
 N_MODES = 90
@@ -118,6 +118,22 @@ def test_the_first_guess_of_the_amplitude_does_not_matter():
     first, second = (learned(ball(prior_mm=prior), motion, sd_mm=0.2) for prior in (4.0, 8.0))
     allowed = np.maximum(0.05 * np.abs(first), 0.02 * np.abs(first).max())
     assert np.all(np.abs(second - first) <= allowed)  # 160 000 entries, over which pytest.approx takes two seconds
+
+
+def test_what_is_learned_of_a_wall_does_not_hang_on_what_was_believed_of_it():
+    """Drift, swelling and finer motion explain a part of each other: whichever begins wide would else keep it."""
+    here = ball()
+    fine = fine_modes(here.points, here.normals)
+    modes, n = np.concatenate([here.modes, fine], axis=1), here.modes.shape[1]
+    motion = drawn(here, sd_mm=0.5, kernel_mm=14.0, seed=2)
+    data, score = modes.T @ modes / 0.1**2, -modes.T @ motion.ravel() / 0.1**2
+    objective, found = moved_by(replace(here.wall, n_fine=fine.shape[1])), list[np.ndarray]()
+    for sds in ((1.0, 0.01), (0.01, 1.0)):
+        prior = np.diag(np.repeat(sds, [n, fine.shape[1]]) ** -2.0)
+        seen = SimpleNamespace(matrix=data + prior, prior=prior, score=score, prior_score=np.zeros(len(data)))
+        learned = hyper_parameters.with_amplitudes(objective, seen, np.zeros(len(data)))
+        found.append(np.diag(np.linalg.inv(learned.parameters.nuisance_precision)))
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
 @pytest.mark.parametrize("sd_mm", [0.05, 1.0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -85,6 +86,18 @@ def test_no_draw_of_a_chain_leaves_the_bounds_and_they_cut_the_density_that_is_a
     law = stats.truncnorm(-np.inf, 1.0, loc=minimum[0], scale=0.05)
     levels = np.array([0.1, 0.5, 0.9])
     assert law.cdf(np.quantile(theta, levels)) == pytest.approx(levels, abs=0.06)
+
+
+def test_every_chain_moves_where_a_part_of_the_unknowns_is_impossible(objective, minimum):
+    """A start there, from where hardly a proposal leads back, would be all that its chain ever tells."""
+    evaluation, frozen = objective(minimum), frozen_posterior(objective, minimum)
+    own = np.linalg.inv(evaluation.matrix)[:2, :2]
+    furthest = minimum[0] + 0.3 * np.sqrt(own[0, 0])
+    cut = SimpleNamespace(objective=objective, value=lambda x: np.inf if x[0] > furthest else frozen.value(x))
+    given = {"bounds": WIDE, "chains": 8, "draws": 20, "rng": np.random.default_rng(1)}
+    found = posterior_chains(cut, minimum, evaluation, own, **given)
+    assert found.accepted.min() > 0.1
+    assert found.theta[..., 0].max() <= furthest
 
 
 def test_chains_of_several_blocks_have_the_covariance_of_laplace_and_the_same_draws_with_a_seed(objective, minimum):

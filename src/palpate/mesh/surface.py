@@ -66,10 +66,19 @@ def triangle_normals(points: NDArray[np.float64], triangles: NDArray[np.int64]) 
 
 
 def vertex_normals(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Unit normals (n_nodes, 3) at nodes (n_nodes, 3) mm, area-weighted over their triangles (n_faces, 3)."""
-    faces = triangle_normals(points, triangles)
-    columns = [np.bincount(triangles.ravel(), np.repeat(faces[:, a], 3), minlength=len(points)) for a in range(3)]
-    summed = np.stack(columns, axis=1).astype(np.float64)
+    """Unit normals (n_nodes, 3) at nodes (n_nodes, 3) mm of triangles (n_faces, 3); 0 at nodes of none.
+
+    n = sum a x b / (|a|^2 |b|^2) over a node's triangles with the edges a, b from it, exact for nodes on a ball (Max
+    1999, Journal of Graphics Tools 4(2), 1-6). Weighted by area the normal leans towards the largest triangle, and a
+    wall that turns in itself seems to move outwards.
+    """
+    corners = points[triangles]
+    edges = np.roll(corners, -1, axis=1) - corners  # each to the next corner
+    squares = np.maximum(np.einsum("tka,tka->tk", edges, edges), np.finfo(float).tiny)
+    weights = 1.0 / (squares * np.roll(squares, 1, axis=1))
+    weighed = weights[:, :, None] * triangle_normals(points, triangles)[:, None]
+    columns = [np.bincount(triangles.ravel(), weighed[..., a].ravel(), minlength=len(points)) for a in range(3)]
+    summed = np.stack(columns, axis=1)
     return np.asarray(summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-30))
 
 

@@ -14,6 +14,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
@@ -126,13 +127,19 @@ def unit_blocks(*n_modes: int) -> tuple[Block, ...]:
 
 
 def wall_blocks(wall: Wall, state: int, *, learned: bool = True) -> tuple[Block, ...]:
-    """The motion of a driver's wall in a later state: a drift and a swelling (see `Wall`), and what is finer."""
-    families = (tuple(product(wall.drifts, wall.swellings)), ((np.eye(wall.n_fine),),))
-    return tuple(
-        Block(wall.name, "driver", Acts.BOUNDARY, (state,), np.eye(n), terms if learned else ())
-        for n, terms in zip((len(wall.columns), wall.n_fine), families, strict=True)
-        if n
+    """The motion of a driver's wall in a later state: a drift and a swelling (see `Wall`), and what is finer.
+
+    The amplitudes of all three are learned together: what one explains the others need not, and in turn whichever was
+    learned first would keep it.
+    """
+    n, m = len(wall.columns), wall.n_fine
+    fine = (np.diag(np.repeat([0.0, 1.0], [n, m])),) if m else ()
+    families = tuple(
+        (*(linalg.block_diag(of, np.zeros((m, m))) for of in family), *fine)
+        for family in product(wall.drifts, wall.swellings)
     )
+    block = Block(wall.name, "driver", Acts.BOUNDARY, (state,), np.eye(n + m), families if learned else ())
+    return (block,) if n + m else ()
 
 
 def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
