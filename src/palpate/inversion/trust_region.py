@@ -337,15 +337,20 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
     """The objective at the end of a step, its model made exact there where its error matters; the evaluations spent.
 
     A step that the trust region cut tells by what is left of it at its end how far away the minimum is, not by its
-    size.
+    size. So does one after which J is no lower where the score still leads on: by what is left across it. Errors of the
+    normals pull a wall along itself, always alike, and no residual changes as they promise.
     """
     n, unknowns = step.objective.n_parameters, step.minimum.unknowns
     objective = step.objective.rematched(unknowns)
     minimum, spent = replace(step.minimum, evaluation=objective(unknowns), outcome=Outcome.STEPS), 1
     tolerance = rule.tolerance(minimum, n)
-    steps = [unknowns - now.minimum.unknowns]
-    if step.cut:
-        steps.append(newton_step(minimum.evaluation, bounds.free(unknowns, minimum.evaluation.score, fixed), n))
+    taken = unknowns - now.minimum.unknowns
+    onward = newton_step(minimum.evaluation, bounds.free(unknowns, minimum.evaluation.score, fixed), n)
+    pull = minimum.evaluation.matrix @ taken
+    along = float(pull @ onward) / max(float(pull @ taken), 1e-30)
+    steps = [taken, onward] if step.cut else [taken]
+    if not step.cut and along > 0.0 and step.then + minimum.evaluation.value - step.minimum.evaluation.value >= step.now:
+        steps = [onward - along * taken]
     size = max(float(np.max(np.abs(d[:n]) / tolerance, initial=0.0)) for d in steps)
     wanted = size
     if np.isfinite(rule.coefficients):
