@@ -232,6 +232,33 @@ def test_a_step_that_the_trust_region_cuts_ends_no_estimate(twins, found, monkey
     assert moved(back.minimum, found.minimum) < 2.0
 
 
+@pytest.mark.parametrize(("ends_at", "fell", "counts"), [(0.5, True, True), (0.5, False, False), (1.5, False, True)])
+def test_where_the_score_leads_on_and_the_objective_is_no_lower_a_step_tells_nothing(
+    twins, found, ends_at, fell, counts
+):
+    """As where normals are wrong alike wherever a wall lies: it slides on, and no residual changes as they promise.
+
+    Not so where the objective falls, nor beyond the minimum, where the score leads back.
+    """
+    end = end_of(found)
+    away = np.append(posterior_sd(found.minimum, 2), np.zeros(end.objective.parameters.n_coefficients))
+    begin = begun(end.objective, end.minimum.unknowns + away)
+    arrived = begun(end.objective, end.minimum.unknowns + (1.0 - ends_at) * away).minimum
+    step = trust_region._Step(
+        end.objective,
+        arrived,
+        begin.minimum.evaluation,
+        now=np.inf if fell else -np.inf,
+        then=0.0,
+        cut=False,
+        settled=False,
+    )
+    bounds = twins.settings(0.5).bounds
+    there, _ = trust_region._evaluated(step, begin, bounds, replace(CHEAP, floor=0.0), fixed=False)
+    whole = ends_at / CHEAP.step_sd
+    assert there.convergence.step == pytest.approx(whole, rel=0.1) if counts else there.convergence.step < 0.1 * whole
+
+
 @pytest.mark.parametrize("radius", [0.02, 0.1])
 def test_no_step_of_what_acts_on_moduli_is_longer_than_the_trust_radius(twins, twin, found, monkeypatch, radius):
     """A layer's stiffness leads as far from where the model is exact as a modulus does."""

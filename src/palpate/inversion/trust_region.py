@@ -140,6 +140,10 @@ class _Step:
     cut: bool
     settled: bool
 
+    def total(self, there: Evaluation) -> float:
+        """J where it ends, by the determinants on linear residuals, from its evaluation there."""
+        return self.then + there.value - self.minimum.evaluation.value
+
     def reductions(self, unknowns: NDArray[np.float64], there: Evaluation) -> tuple[float, float]:
         """By how much J falls on a way from unknowns (n,) to where it is evaluated, and on linear residuals.
 
@@ -224,7 +228,7 @@ def _iteration(
             continue
         failure, trial_evaluations = None, trial_evaluations + spent
         seen = there.minimum.evaluation
-        then = step.then + seen.value - step.minimum.evaluation.value
+        then = step.total(seen)
         gain, promised = step.reductions(before.unknowns, seen)
         others = bool(now.objective.chosen) and _numbers(step.objective) != _numbers(now.objective)
         if (gain + NOISE) / (promised + NOISE) > BAD and not (others and then - step.now > AS_GOOD):
@@ -344,12 +348,11 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
     objective = step.objective.rematched(unknowns)
     minimum, spent = replace(step.minimum, evaluation=objective(unknowns), outcome=Outcome.STEPS), 1
     tolerance = rule.tolerance(minimum, n)
-    taken = unknowns - now.minimum.unknowns
+    taken, matrix = unknowns - now.minimum.unknowns, minimum.evaluation.matrix
     onward = newton_step(minimum.evaluation, bounds.free(unknowns, minimum.evaluation.score, fixed), n)
-    pull = minimum.evaluation.matrix @ taken
-    along = float(pull @ onward) / max(float(pull @ taken), 1e-30)
+    along = float(taken @ matrix @ onward) / max(float(taken @ matrix @ taken), 1e-30)
     steps = [taken, onward] if step.cut else [taken]
-    if not step.cut and along > 0.0 and step.then + minimum.evaluation.value - step.minimum.evaluation.value >= step.now:
+    if not step.cut and along > 0.0 and step.total(minimum.evaluation) >= step.now:
         steps = [onward - along * taken]
     size = max(float(np.max(np.abs(d[:n]) / tolerance, initial=0.0)) for d in steps)
     wanted = size
