@@ -135,11 +135,7 @@ def test_the_result_meets_the_schema_that_is_shipped(result):
     jsonschema.Draft202012Validator(schemas["result.schema.json"], registry=registry).validate(result)
 
 
-def test_the_truth_lies_within_the_interval(inputs, tmp_path):
-    """Of balls that are said to be bonded, as these are."""
-    flags = ["--set", "discrepancy.layer_sd=0", "--output", str(tmp_path), "--quiet"]
-    assert main(["estimate", str(inputs / "case.toml"), *flags]) == 0
-    result = json.loads((tmp_path / "result.json").read_text())
+def test_the_truth_lies_within_the_interval(result):
     assert result["status"] == "converged", result["reason"]
     assert [item["tissue"] for item in result["estimates"]] == list(TRUTH_KPA)
     for item in result["estimates"]:
@@ -148,19 +144,6 @@ def test_the_truth_lies_within_the_interval(inputs, tmp_path):
         assert low < truth < high
         assert item["value"] == pytest.approx(truth, rel=0.3)
         assert item["ratio"] == pytest.approx(item["value"] / 10.0)
-
-
-def test_what_is_stated_where_something_soft_may_lie_between_them_holds_the_truth(result):
-    """A modulus whose interval spans more than a factor of 10 has none."""
-    assert result["status"] == "converged", result["reason"]
-    stated = [item for item in result["estimates"] if item["interval95"] is not None]
-    assert stated
-    for item in result["estimates"]:
-        assert item["value"] == pytest.approx(TRUTH_KPA[item["tissue"]], rel=0.3)
-        assert (item["verdict"] == "not identified") == (item not in stated)
-    for item in stated:
-        low, high = item["interval95"]
-        assert low < TRUTH_KPA[item["tissue"]] < high
 
 
 def test_the_result_has_every_key_of_its_schema(result):
