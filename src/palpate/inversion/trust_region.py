@@ -230,8 +230,8 @@ def _iteration(
         seen = there.minimum.evaluation
         then = step.total(seen)
         gain, promised = step.reductions(before.unknowns, seen)
-        others = bool(now.objective.chosen) and _numbers(step.objective) != _numbers(now.objective)
-        if (gain + NOISE) / (promised + NOISE) > BAD and not (others and then - step.now > AS_GOOD):
+        others, first = _numbers(step.objective) != _numbers(now.objective), not now.objective.chosen
+        if (gain + NOISE) / (promised + NOISE) > BAD and (first or not others or then - step.now <= AS_GOOD):
             region = region.after(gain / max(promised, 1e-9), longest, grows=grows)
             end, spent = there.minimum, before.evaluations + trial_evaluations
             arrived = Iterate(end.unknowns[:n], seen.value, seen.misfit_mm2, newton_decrement(seen))

@@ -180,7 +180,7 @@ def offset_block(observation: Observation, state: int, *, sd: float) -> Block:
     if observation.of_driver:
         return Block(*own, considered=True)
     alternatives = tuple((np.full((1, 1), (share * sd) ** 2),) for share in (DRAWN_ALIKE, 1.0))
-    return Block(*own, alternatives, amplitudes=(1.0, 1.0), odds=(0.0, float(np.log(SELDOM))))
+    return Block(*own, alternatives, amplitudes=(1.0, 1.0), odds=(0.0, float(np.log(SELDOM))), last=True)
 
 
 def instrument_block(name: str, state: int, *, sd: float) -> Block:
