@@ -109,6 +109,14 @@ def test_a_surface_that_is_drawn_larger_is_found_and_no_modulus_pays_for_it(twin
     assert off[0] < 0.3 * off[1]
 
 
+def test_an_offset_is_believed_wide_until_the_estimate_has_converged_under_what_else_there_is(twins, twin):
+    """Held small at first, what is drawn otherwise is taken for motion, and from there no choice leads back."""
+    (state,) = twins.voxel_problem(twin).states
+    block = offset_block(state.observations[0], 0, sd=0.5)
+    assert block.last
+    assert 1.0 / np.sqrt(block.precision) == pytest.approx(0.5)
+
+
 def test_another_kind_of_boundary_motion_is_a_block_and_its_modes(twins, twin):
     """A table that presses on the body: one more mode of what is prescribed, one more block, and nothing else."""
     space, old = twin.model.space, twin.model.constraint

@@ -152,6 +152,32 @@ def test_alternatives_stay_where_the_objective_rises_by_what_was_promised_of_oth
     assert len(end.totals) == 1
 
 
+def test_a_first_choice_that_does_not_hold_where_it_leads_is_put_off_and_no_step_shortened(twins, found, monkeypatch):
+    """Before it priors are not those of J: a loop would go on in steps of the size that the choice allows."""
+    size, sd = float(np.sqrt(np.mean(found.minimum.unknowns[2:] ** 2))), posterior_sd(found.minimum, 2)
+    objective = replace(twins.mixture(end_of(found).objective, (size, 20.0 * size)), chosen=())
+    away = found.minimum.unknowns + 0.5 * np.append(sd, np.zeros(len(found.minimum.unknowns) - 2))
+    evaluated, bounds = trust_region._evaluated, twins.settings(0.5).bounds
+
+    def rises(step, now, *others):
+        there, spent = evaluated(step, now, *others)
+        if step.objective.chosen == now.objective.chosen:
+            return there, spent
+        seen = there.minimum.evaluation
+        uphill = replace(seen, score=seen.score + 1e12 * (there.minimum.unknowns - away), value=seen.value + 1e3)
+        return replace(there, minimum=replace(there.minimum, evaluation=uphill)), spent
+
+    monkeypatch.setattr(trust_region, "_evaluated", rises)
+    ends = [
+        minimised(
+            begun(objective, away), bounds, replace(CHEAP, iterations=1, learn=learn), progress=twins.silent, title=""
+        )
+        for learn in (True, False)
+    ]
+    assert ends[0].objective.chosen == ()
+    assert np.array_equal(ends[0].minimum.unknowns, ends[1].minimum.unknowns)
+
+
 def test_no_accepted_step_raises_the_objective(twins, twin, voxels):
     """But for the noise of closest points; all of them together lower it."""
     objective = with_first_noise(twins.objective_of(voxels, twin.coefficients))
