@@ -30,3 +30,11 @@ def test_normals_of_what_belongs_to_no_triangle_are_none():
     assert vertex_normals(points, np.array([[0, 1, 2]])) == pytest.approx(
         np.vstack([np.ones((3, 3)) / 3**0.5, np.zeros(3)])
     )
+
+
+def test_a_triangle_without_area_changes_no_normal():
+    """As somebody else's mesh may have one: two of its corners are one place."""
+    points = np.vstack([np.eye(3), np.eye(3)[:1]])
+    assert vertex_normals(points, np.array([[0, 1, 2], [0, 3, 1]])) == pytest.approx(
+        np.vstack([np.ones((3, 3)) / 3**0.5, np.zeros(3)])
+    )

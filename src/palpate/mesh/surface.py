@@ -74,9 +74,8 @@ def vertex_normals(points: NDArray[np.float64], triangles: NDArray[np.int64]) ->
     """
     corners = points[triangles]
     edges = np.roll(corners, -1, axis=1) - corners  # each to the next corner
-    squares = np.maximum(np.einsum("tka,tka->tk", edges, edges), np.finfo(float).tiny)
-    weights = 1.0 / (squares * np.roll(squares, 1, axis=1))
-    weighed = weights[:, :, None] * triangle_normals(points, triangles)[:, None]
+    inverse = edges / np.maximum(np.einsum("tka,tka->tk", edges, edges), 1e-30)[:, :, None]
+    weighed = np.cross(np.roll(inverse, 1, axis=1), inverse)  # b, from a corner to the one before it, is minus an edge
     columns = [np.bincount(triangles.ravel(), weighed[..., a].ravel(), minlength=len(points)) for a in range(3)]
     summed = np.stack(columns, axis=1)
     return np.asarray(summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-30))

@@ -84,9 +84,7 @@ def posterior_chains(
         now = start + SPREAD * laplace.draws(1, generator)[0]
         inside = np.clip(start[:n] + stretch @ (now[:n] - start[:n]), bounds.lower, bounds.upper)
         now[:n] = start[:n] + SHRUNK * np.linalg.solve(stretch, inside - start[:n])
-        while not np.isfinite(
-            straight.energy(now)[0]
-        ):  # beyond any stiffness of a share: no proposal leads out of there
+        while not np.isfinite(straight.energy(now)[0]):  # stiffer than any share makes it: no proposal leads out
             now = 0.5 * (start + now)
         parts, accepted = [], 0
         for done in range(0, warm + steps, BLOCK):
