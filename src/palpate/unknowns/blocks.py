@@ -56,12 +56,12 @@ class Block:
     of: the tissue that it is of, or the frame; cause: by which shares of a variance are told; unit_mm: what a
     coefficient of 1 is worth where it is a motion; precision: P (n, n) before anything is learned. alternatives:
     families of covariances sum_t a_t^2 C_t (n, n), each the tuple of its terms C_t, of which the images choose one with
-    its amplitudes a_t, by their evidence; none where P is held. amplitudes: bounds of a_t; odds: log prior
-    odds of the alternatives, of which the likeliest is taken; none: of alternatives that are alike the widest.
-    considered: the images cannot tell them, so that they are held at 0, and what they may be counts in the covariance
-    (Schmidt 1966). last: its prior is learned where the estimate has converged under those of the others; before it
-    would take what they explain, or leave it to them. rivals: causes that explain as much as its last alternative, which is none where a
-    block of theirs has left its first one. released: held at 0 as well while an estimate is sought, and free under P
+    its amplitudes a_t, by their evidence; none where P is held. amplitudes: bounds of a_t; odds: log prior odds of the
+    alternatives, of which the likeliest is taken; none: of alternatives that are alike the widest. considered: the
+    images cannot tell them, so that they are held at 0, and what they may be counts in the covariance (Schmidt 1966).
+    last: its prior is learned where the estimate has converged under those of the others; before it would take what
+    they explain, or leave it to them. rivals: causes that explain as much as its last alternative, which is none where
+    a block of theirs has left its first one. released: held at 0 as well while an estimate is sought, and free under P
     where its interval is. left_out: variances of the first noise, a tenth of the found one, that what is left out of
     the unknowns may explain (see `informed_problem`); below 0 none is. regions: numbers of the model's regions whose
     moduli it multiplies, one unknown x for all of them, where it acts on moduli: a `share` s of each, in series with
@@ -173,8 +173,8 @@ def offset_block(observation: Observation, state: int, *, sd: float) -> Block:
 
     A mixture of two normal laws, of which the evidence chooses: drawn alike but for a tenth of sd, or otherwise by sd,
     which is so seldom that a bias of some hundredths of a millimetre is not taken for it. Until an estimate has
-    converged it is the latter: what is held at first is taken for motion. A driver's wall moves as its drawing does: its offset is
-    considered, not estimated.
+    converged it is the latter: what is held at first is taken for motion. A driver's wall moves as its drawing does:
+    its offset is considered, not estimated.
     """
     own = (observation.name, "offset", Acts.RESIDUALS, (state,), np.full((1, 1), sd**-2.0))
     if observation.of_driver:
