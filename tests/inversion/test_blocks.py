@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion import InverseProblem, LaterState, invert
+from palpate.inversion import InverseProblem, LaterState, begun, invert, with_hyper_parameters
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.material import material_modes
@@ -111,10 +111,15 @@ def test_a_surface_that_is_drawn_larger_is_found_and_no_modulus_pays_for_it(twin
 
 def test_an_offset_is_believed_wide_until_the_estimate_has_converged_under_what_else_there_is(twins, twin):
     """Held small at first, what is drawn otherwise is taken for motion, and from there no choice leads back."""
-    (state,) = twins.voxel_problem(twin).states
-    block = offset_block(state.observations[0], 0, sd=0.5)
-    assert block.last
-    assert 1.0 / np.sqrt(block.precision) == pytest.approx(0.5)
+    problem = drawn_otherwise(twins, twin, lambda seen: [offset_block(o, 0, sd=0.5) for o in seen])
+    start = begun(twins.objective_of(problem, twin.coefficients), np.append(twin.unknowns, np.zeros(3)))
+    sds = list[float]()
+    for last in (False, True):
+        objective = replace(start.objective, learn_last=last)
+        learned = with_hyper_parameters(objective, start.minimum.evaluation, start.minimum.unknowns)
+        sds.append(float(1.0 / np.sqrt(learned.parameters.prior_matrix[-2, -2])))  # of the body, drawn alike
+    assert sds[0] == pytest.approx(0.5)
+    assert sds[1] < 0.1
 
 
 def test_another_kind_of_boundary_motion_is_a_block_and_its_modes(twins, twin):

@@ -14,14 +14,9 @@ def test_a_balls_normals_are_its_rays_however_it_is_cut_into_triangles(radius):
     rng = np.random.default_rng(3)
     rays = rng.normal(size=(60, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    hull = spatial.ConvexHull(rays)
-    inside_out = (
-        np.einsum(
-            "ta,ta->t", np.cross(*np.moveaxis(np.diff(rays[hull.simplices], axis=1), 1, 0)), hull.equations[:, :3]
-        )
-        < 0
-    )
-    triangles = np.where(inside_out[:, None], hull.simplices[:, ::-1], hull.simplices).astype(np.int64)
+    corners = spatial.ConvexHull(rays).simplices.astype(np.int64)
+    inwards = np.linalg.det(rays[corners]) < 0.0
+    triangles = np.where(inwards[:, None], corners[:, ::-1], corners)
     assert vertex_normals(radius * rays, triangles) == pytest.approx(rays, abs=1e-9)
 
 

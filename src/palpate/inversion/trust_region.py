@@ -212,7 +212,8 @@ def _iteration(
     """One accepted step, or `STUCK` where none of some trials is; the region for the next, and whether it may grow.
 
     A step that brings other alternatives is taken only where J does not rise by more than what is as good: else the
-    linear residuals promised of them what does not hold where they lead, and it is taken again without.
+    linear residuals promised of them what does not hold where they lead, and it is taken again without. So is one with
+    the first choice that gains too little; before that choice priors are not those of J, which may rise by it.
     """
     n, before = now.objective.n_parameters, now.minimum
     moduli = np.append(np.arange(n), now.objective.parameters.acting_on_moduli)

@@ -56,10 +56,10 @@ def posterior_chains(
     unknowns q, with the minimum c: A = L M^-1 stretches the log-moduli, M M^T their covariance by the Gauss-Newton
     matrix, L L^T = `covariance` (n_parameters, n_parameters), that by correlated residuals, prior and grid (the
     open-faced sandwich: Shaby, J. Comput. Graph. Stat. 23 (2014) 853-876). evaluation: of the objective at the minimum
-    `start` (n,). Every chain starts elsewhere, at 1.5 standard deviations, and leaves out a tenth of its draws; a draw
-    is the last of ten steps: x' = c + sqrt(1 - b^2) (x - c) + b L xi with L L^T = H^-1, preconditioned Crank-Nicolson,
-    which a posterior that is exactly normal always accepts (Cotter, Roberts, Stuart & White, Stat. Sci. 28 (2013)
-    424-446). Raises `EstimationError` where a modulus moves nothing.
+    `start` (n,). Every chain starts elsewhere, at 1.5 standard deviations or where the density is not 0, and leaves out
+    a tenth of its draws; a draw is the last of ten steps: x' = c + sqrt(1 - b^2) (x - c) + b L xi with L L^T = H^-1,
+    preconditioned Crank-Nicolson, which a posterior that is exactly normal always accepts (Cotter, Roberts, Stuart &
+    White, Stat. Sci. 28 (2013) 424-446). Raises `EstimationError` where a modulus moves nothing.
 
     Steps are made in y of what acts on moduli in series with the rest of a region (see `in_series`), not in its x: the
     log-moduli that go with it lie on a curve in x, and nearly on a line in y.
