@@ -48,7 +48,6 @@ from palpate.study import (
     inverse_problem,
     inversion_settings,
     make_body,
-    released_of,
     stated_posteriors,
 )
 from palpate.uncertainty import covariance_of, gain, noise_covariance
@@ -223,11 +222,10 @@ def _moduli(inversion: Inversion, body: Body, row: Row) -> list[Result]:
     objective, minimum = inversion.objective, inversion.minimum
     errors = [[np.zeros(len(line.weights)) for line in minimum.evaluation.linearisations]] * NO_GRID
     bonded = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
-    released, remark = released_of(inversion, body.settings)
-    covariance, posteriors = stated_posteriors(inversion, bonded, released)
+    covariance, posteriors = stated_posteriors(inversion, bonded)
     known = intervals_of(inversion, body.settings, posteriors)
     without = intervals_of(inversion, body.settings, posteriors[:1])
-    estimates = estimates_of(inversion, known, covariance, truth={}, layers_told=not remark)
+    estimates = estimates_of(inversion, known, covariance, truth={})
     limits = _limits(inversion, row)
     of_noise = None if row.limit is None else _by_true_noise(inversion, row.limit)
     scale, found = objective.parameters.scale_kpa, []

@@ -27,6 +27,7 @@ Misleading = Literal[
     "volume-change",
     "void-moves",
     "drawn-otherwise",
+    "layer",
     "several-bodies",
     "open-contours",
     "overlap",

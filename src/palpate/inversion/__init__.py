@@ -8,7 +8,6 @@ from palpate.inversion.estimate import InversionSettings as InversionSettings
 from palpate.inversion.estimate import continue_at_finite_strain as continue_at_finite_strain
 from palpate.inversion.estimate import first_noise_of as first_noise_of
 from palpate.inversion.estimate import invert as invert
-from palpate.inversion.estimate import with_released as with_released
 from palpate.inversion.frozen_posterior import FixedCorrespondence as FixedCorrespondence
 from palpate.inversion.frozen_posterior import FrozenPosterior as FrozenPosterior
 from palpate.inversion.frozen_posterior import fixed_correspondence as fixed_correspondence

@@ -46,7 +46,9 @@ class Candidate:
 class Inversion:
     """The distinct minima, the number of the best one, every start, and the evaluation at no motion (`rest`).
 
-    evaluations, counts: of everything that was followed to find and compare them, not of the best one alone.
+    evaluations, counts: of everything that was followed to find and compare them, not of the best one alone. released:
+    the best one followed on with those blocks free that are held while it is sought (see `Block.released`); None where
+    there are none, or where the best one itself has them free. unsettled: why it did not end, "" where it did.
     """
 
     candidates: tuple[Candidate, ...]
@@ -55,6 +57,8 @@ class Inversion:
     rest: Evaluation
     evaluations: int
     counts: SolveCounts
+    released: OuterIterate | None = None
+    unsettled: str = ""
 
     @property
     def objective(self) -> Objective:

@@ -25,7 +25,7 @@ from palpate.inversion.optimise import (
     gauss_newton,
     same_minimum,
 )
-from palpate.inversion.trust_region import NEAR, OuterIterate, StopRule, begun, minimised
+from palpate.inversion.trust_region import NEAR, OuterIterate, StopRule, begun, minimised, total_counted_as
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
 from palpate.parallel import blas_on_one_thread
@@ -58,6 +58,7 @@ def invert(
 
     States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle start
     and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows ends near.
+    At last blocks are `released` that were held.
     Raises `ConfigurationError` for an open Poisson's ratio with another law, `EstimationError`s of solving; an estimate
     that did not converge says so in its minimum's outcome.
     """
@@ -74,9 +75,10 @@ def invert(
     else:
         linear = [_linear(Objective(problem.states, problem.parameters), begin, 0, settings, last, progress)]
     if not problem.finite_strain:
-        return linear[0]
+        return with_released(linear[0], settings, progress=progress, rule=rule)
     there = during("finite strain", progress)
-    return continue_at_finite_strain(linear.pop(), settings, progress=there, rule=rule)  # which lets go of its bases
+    found = continue_at_finite_strain(linear.pop(), settings, progress=there, rule=rule)  # which lets go of its bases
+    return with_released(found, settings, progress=there, rule=rule)
 
 
 @blas_on_one_thread()
@@ -131,23 +133,55 @@ def continue_at_finite_strain(
     return replace(found, evaluations=found.evaluations + evaluations, counts=spent)
 
 
-@blas_on_one_thread()
-def with_released(inversion: Inversion, settings: InversionSettings, *, progress: Progress) -> OuterIterate | None:
-    """The best minimum followed on with those blocks free that were held while it was sought (see `Block.released`).
+def with_released(
+    inversion: Inversion, settings: InversionSettings, *, progress: Progress, rule: StopRule
+) -> Inversion:
+    """The inversion with its best minimum followed on with those blocks free that were held (see `Block.released`).
 
-    None where there is no such block, or no minimum to follow. Raises `EstimationError`s of solving; one that did not
-    converge says so in its minimum's outcome.
+    Where J, with the same numbers of independent residuals, is then less by more than what is as good, the images tell
+    of what was held, and this is the estimate, followed until it ends by the `rule`. Where it does not end the
+    inversion says why. Nothing changes where there is no such block, or no minimum to follow.
     """
-    best = inversion.candidates[inversion.best].iterate
-    causes = dict.fromkeys(block.cause for block in inversion.objective.parameters.blocks if block.released)
-    if not best.minimum.converged or not causes:
-        return None
-    unknowns = best.minimum.unknowns
-    objective, evaluation = best.objective.released(best.minimum.evaluation, unknowns)
-    places = objective.linearisation_points(unknowns, evaluation)
-    near = [known.update(place) for known, place in zip(objective.approximations, places, strict=True)]
-    start = replace(begun(objective.under(near), unknowns), checks=best.checks)
-    return minimised(start, settings.bounds, NEAR, progress=progress, title=f"with {' and '.join(causes)} free")
+    best = inversion.candidates[inversion.best]
+    held, causes = best.iterate, dict.fromkeys(b.cause for b in inversion.objective.parameters.blocks if b.released)
+    if not held.minimum.converged or not causes:
+        return inversion
+    unknowns, title, bounds = held.minimum.unknowns, f"with {' and '.join(causes)} free", settings.bounds
+    try:
+        objective, evaluation = held.objective.released(held.minimum.evaluation, unknowns)
+        places = objective.linearisation_points(unknowns, evaluation)
+        near = [known.update(place) for known, place in zip(objective.approximations, places, strict=True)]
+        start = replace(begun(objective.under(near), unknowns), checks=held.checks)
+        free = minimised(start, bounds, NEAR, progress=progress, title=title)
+    except EstimationError as error:
+        return replace(inversion, unsettled=str(error))
+    inversion = replace(_followed(inversion, held, free), released=free)
+    if not free.minimum.converged:
+        return replace(inversion, unsettled=free.minimum.outcome.value)
+    gain = held.objective.total(held.minimum.evaluation) - total_counted_as(free, held)
+    if gain <= AS_GOOD:
+        return inversion
+    start = replace(free, minimum=replace(free.minimum, evaluations=0))
+    try:
+        end = minimised(start, bounds, rule, progress=progress, title=title)
+        end = _at_equilibrium(end, ()) if inversion.objective.states[0].finite_strain else end
+    except EstimationError as error:
+        progress(f"{title}: likelier by {gain:.1f}, but not followed to its end: {error}")
+        return inversion
+    inversion = _followed(inversion, free, end)
+    if end.minimum.converged:
+        history = (*held.minimum.history, *free.minimum.history[1:], *end.minimum.history[1:])
+        end = replace(end, minimum=replace(end.minimum, history=history))
+        candidates = list(inversion.candidates)
+        candidates[inversion.best] = replace(best, iterate=end, value=best.value - gain)
+        inversion = replace(inversion, candidates=tuple(candidates), released=None)
+    return inversion
+
+
+def _followed(inversion: Inversion, before: OuterIterate, after: OuterIterate) -> Inversion:
+    """The inversion with what it cost to follow a minimum on from `before`."""
+    evaluations = inversion.evaluations + after.minimum.evaluations
+    return replace(inversion, evaluations=evaluations, counts=inversion.counts + (after.counts - before.counts))
 
 
 def _with_reduced_bases(

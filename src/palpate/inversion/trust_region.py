@@ -186,7 +186,7 @@ def minimised(
         now, region = _iteration(now, bounds, rule, region, fixed, grows=early)
         if now.minimum.outcome is Outcome.STUCK:
             break
-        if ends and number == last + TRIED and _total_counted_as(now, now) >= _total_counted_as(ends[-1], now):
+        if ends and number == last + TRIED and total_counted_as(now, now) >= total_counted_as(ends[-1], now):
             break
         if now.convergence.converged:
             last = number
@@ -267,14 +267,14 @@ def _likeliest(ends: Sequence[OuterIterate], last: OuterIterate) -> OuterIterate
 
     The cost is that of all, up to the `last` iteration.
     """
-    best = ends[0] if len(ends) == 1 else min(ends, key=lambda end: _total_counted_as(end, ends[-1]))
+    best = ends[0] if len(ends) == 1 else min(ends, key=lambda end: total_counted_as(end, ends[-1]))
     if best.minimum.evaluations == last.minimum.evaluations:
         return best
     spent = last.counts - replace(best, checks=SolveCounts()).counts
     return replace(best, minimum=replace(best.minimum, evaluations=last.minimum.evaluations), checks=spent)
 
 
-def _total_counted_as(iterate: OuterIterate, other: OuterIterate) -> float:
+def total_counted_as(iterate: OuterIterate, other: OuterIterate) -> float:
     """J where an iteration ended, with the numbers of independent residuals of another one."""
     objective, at = iterate.objective.counted_as(other.objective), iterate.minimum
     return objective.total(LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns))

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from palpate.study.edge_length import edge_length_of as edge_length_of
     from palpate.study.estimation import Observed as Observed
     from palpate.study.estimation import conclude as conclude
-    from palpate.study.estimation import released_of as released_of
     from palpate.study.estimation import stated_posteriors as stated_posteriors
     from palpate.study.imaged import ImagedStates as ImagedStates
     from palpate.study.imaged import aligned as aligned

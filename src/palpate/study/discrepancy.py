@@ -13,6 +13,7 @@ from palpate.images.checks import later_names
 from palpate.inversion import Inversion
 from palpate.mesh.surface import cut_faces
 from palpate.uncertainty import NORMAL_95, FittedState
+from palpate.unknowns import LAYER, in_series
 
 TOLD = 2.0  # standard deviations, from which an offset is said in words
 LEAST_TOLD_MM = 0.1
@@ -56,12 +57,31 @@ class HeterogeneityFound:
 
 
 @dataclass(frozen=True, slots=True)
+class LayerFound:
+    """How stiff a layer round an organ is, over the tissue that it is of, with a 95 % interval."""
+
+    tissue: str
+    ratio: float
+    interval95: tuple[float, float]
+
+    @property
+    def told(self) -> bool:
+        """Whether it differs from its tissue by so much more than its own uncertainty."""
+        low, high = np.log(self.interval95)
+        return abs(float(np.log(self.ratio))) > TOLD * float(high - low) / (2.0 * NORMAL_95)
+
+
+@dataclass(frozen=True, slots=True)
 class FoundDiscrepancy:
-    """All of it: the frame of each later state (None: it is held), offsets, tissues that are not homogeneous."""
+    """All of it: the frame of each later state (None: it is held), offsets, tissues that are not homogeneous.
+
+    layers: round organs, none where the estimate takes them for their tissue.
+    """
 
     frame: tuple[FrameFound | None, ...] = ()
     offsets: tuple[OffsetFound, ...] = ()
     heterogeneity: tuple[HeterogeneityFound, ...] = ()
+    layers: tuple[LayerFound, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,11 +98,16 @@ class FittedMaterial:
 def fitted_materials(inversion: Inversion) -> tuple[FittedMaterial, ...]:
     """The material of the best minimum, one a later state."""
     parameters, found = inversion.objective.parameters, list[FittedMaterial]()
-    coefficients = parameters.coefficients(inversion.minimum.unknowns)
+    unknowns = inversion.minimum.unknowns
+    coefficients, blocks = parameters.coefficients(unknowns), enumerate(parameters.blocks)
+    layers = [(b, unknowns[parameters.columns(i)]) for i, b in blocks if b.cause == LAYER and not b.released]
     for state, of_state in zip(inversion.objective.states, coefficients, strict=True):
         mesh, material = state.model.space.mesh, state.model.material
         own = of_state[state.model.constraint.n_modes :]
         logs = np.log(material.scale(own)) if material.fields.shape[1] else np.zeros(len(mesh.tets))
+        for block, x in layers:
+            inside = np.isin(mesh.region, [state.model.regions[region] for region in block.regions])
+            logs[inside] += in_series(x, np.array([block.share]))
         shifts = {mesh.tissues[number].name: shift for number, shift in material.poisson_shifts(own).items()}
         found.append(FittedMaterial(logs, shifts))
     return tuple(found)
@@ -92,7 +117,7 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
     """What the blocks of unknowns of a converged inversion say, with the fitted later states."""
     parameters, unknowns = inversion.objective.parameters, inversion.minimum.unknowns
     n = parameters.n_parameters
-    offsets, heterogeneity = list[OffsetFound](), list[HeterogeneityFound]()
+    offsets, heterogeneity, layers = list[OffsetFound](), list[HeterogeneityFound](), list[LayerFound]()
     smooth = dict[int, float]()
     rows = np.linalg.inv(inversion.minimum.evaluation.matrix)
     for number, block in enumerate(parameters.blocks):
@@ -106,6 +131,10 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
         elif block.cause == "heterogeneity":
             patchy = block.alternatives[1][0]  # the first is nearly homogeneous, the last very patchy
             heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(np.mean(np.diag(patchy))))))
+        elif block.cause == LAYER and not block.released:
+            x, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(rows[own[0], own[0]]))
+            low, ratio, high = np.exp([x - half, x, x + half]).tolist()
+            layers.append(LayerFound(block.of, ratio, (low, high)))
         elif block.cause == "frame":
             smooth.setdefault(block.states[0], learned * block.unit_mm)
     frames = list[FrameFound | None]([None] * len(states))
@@ -113,11 +142,11 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
         points = np.unique(states[s].space.facets(cut_faces(states[s].space.mesh)))
         motion = np.linalg.norm(states[s].displacement[points], axis=1) if len(points) else np.zeros(1)
         frames[s] = FrameFound(float(np.sqrt(np.mean(motion**2))), float(motion.max()), prior_mm)
-    return FoundDiscrepancy(tuple(frames), tuple(offsets), tuple(heterogeneity))
+    return FoundDiscrepancy(tuple(frames), tuple(offsets), tuple(heterogeneity), tuple(layers))
 
 
 def discrepancy_findings(found: FoundDiscrepancy) -> tuple[Finding, ...]:
-    """A sentence for each surface that is drawn otherwise in a later image."""
+    """A sentence for each surface that is drawn otherwise in a later image, and for each layer round an organ."""
     findings = []
     names = later_names(1 + max((offset.state for offset in found.offsets), default=0))
     for offset in found.offsets:
@@ -131,4 +160,13 @@ def discrepancy_findings(found: FoundDiscrepancy) -> tuple[Finding, ...]:
                 " sure"
             )
             findings.append(Finding("drawn-otherwise", text, place=place))
+    for layer in found.layers:
+        if layer.told:
+            low, high = layer.interval95
+            text = (
+                f"round '{layer.tissue}' lies a layer that is {layer.ratio:.2g} times as stiff as the tissue that it is"
+                f" of ({low:.2g} to {high:.2g}): a film of fat, a capsule, or a plane on which it slides? The estimate"
+                " has it, for the images are more likely so; a modulus of another study without it is another quantity"
+            )
+            findings.append(Finding("layer", text))
     return tuple(findings)

@@ -41,6 +41,15 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
                 " the model may not fit the images (edge length, driver modes, law), or [noise] should be given",
             )
         )
+    if inversion.unsettled:
+        findings.append(
+            Finding(
+                "unsettled",
+                f"with the stiffness of layers round organs free the estimate did not end ({inversion.unsettled}), so"
+                " that the intervals do not hold what a soft or stiff layer would do; another [mesh] edge_length_mm may"
+                " help, or [discrepancy] layer_sd = 0 where there is none",
+            )
+        )
     lost = [c for c in inversion.candidates if c.minimum.outcome is Outcome.NO_EQUILIBRIUM]
     if lost:
         findings.append(

@@ -8,18 +8,14 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import EstimationError
-from palpate.findings import Finding
 from palpate.inversion import (
     Inversion,
     InversionSettings,
     Iterate,
     Linearisation,
     Outcome,
-    OuterIterate,
     StartRun,
     frozen_posterior,
-    with_released,
 )
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, seen_by
@@ -73,12 +69,11 @@ def conclude(
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
     errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
     bonded = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
-    released, remark = released_of(inversion, settings, progress=progress)
-    covariance, posteriors = stated_posteriors(inversion, bonded, released)
+    covariance, posteriors = stated_posteriors(inversion, bonded)
     progress("intervals: profiles, and the fit of every surface before and after")
-    pairs = image_pairs_of(inversion, settings.bounds, errors, released)
+    pairs = image_pairs_of(inversion, settings.bounds, errors)
     known = intervals_of(inversion, settings, posteriors)
-    estimates = estimates_of(inversion, known, covariance, truth=truth, layers_told=not remark)
+    estimates = estimates_of(inversion, known, covariance, truth=truth)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
     stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
     pairs = pairs and pairs.with_intervals_of(stating)
@@ -97,7 +92,6 @@ def conclude(
     fits, forces, points = _seen(inversion, observed)
     findings = (
         *inversion_findings(inversion, covariance.total),
-        *remark,
         *pair_findings(pairs),
         *fold_findings(observed.states),
         *data_findings(inversion),
@@ -132,43 +126,21 @@ def conclude(
     )
 
 
-def stated_posteriors(
-    inversion: Inversion, bonded: Covariance, released: OuterIterate | None
-) -> tuple[Covariance, tuple[StatedPosterior, ...]]:
+def stated_posteriors(inversion: Inversion, bonded: Covariance) -> tuple[Covariance, tuple[StatedPosterior, ...]]:
     """All that is stated rests on these: the covariance by all causes, and the posteriors, the widest last.
 
-    The first is that of the estimate, with its covariance while released blocks are held (`bonded`); the other, where
-    they were `released`, is about the minimum with them free, and has what they add.
+    The first is that of the estimate, with its own covariance (`bonded`, where blocks are held that may be free); the
+    other, where such blocks were released, is about the minimum with them free, and has what they add.
     """
     objective, minimum = inversion.objective, inversion.minimum
     fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
     first = StatedPosterior(fixed, minimum, bonded.total)
-    if released is None:
+    if (released := inversion.released) is None:
         return bonded, (first,)
     sandwich = sandwich_covariance(released.objective, released.minimum.evaluation)
     covariance = bonded.with_released(objective, minimum.evaluation, sandwich)
     free = frozen_posterior(released.objective, released.minimum.unknowns, released.minimum.evaluation)
     return covariance, (first, StatedPosterior(free, released.minimum, covariance.total))
-
-
-def released_of(
-    inversion: Inversion, settings: InversionSettings, *, progress: Progress = silent
-) -> tuple[OuterIterate | None, tuple[Finding, ...]]:
-    """The minimum with released blocks free, where there is one, and what is told where there should be."""
-    try:
-        found = with_released(inversion, settings, progress=progress)
-    except EstimationError as error:
-        found, why = None, str(error)
-    else:
-        if found is None or found.minimum.converged:
-            return found, ()
-        why = found.minimum.outcome.value
-    text = (
-        f"with the stiffness of layers round organs free the estimate did not end ({why}), so that the intervals do not"
-        " hold what a soft or stiff layer would do; another [mesh] edge_length_mm may help, or [discrepancy]"
-        " layer_sd = 0 where there is none"
-    )
-    return found, (Finding("unsettled", text),)
 
 
 def _reason(inversion: Inversion) -> str:

@@ -403,4 +403,5 @@ def _discrepancy(found: FoundDiscrepancy, names: Sequence[str]) -> dict[str, Any
             for of in found.offsets
         ],
         "heterogeneity": [_plain(of) for of in found.heterogeneity],
+        "layers": [_plain(of) for of in found.layers],
     }

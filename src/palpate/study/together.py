@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from palpate.inversion import Bounds, FrozenPosterior, Inversion, LeastSquares, Minimum, OuterIterate
+from palpate.inversion import Bounds, FrozenPosterior, Inversion, LeastSquares, Minimum
 from palpate.parallel import mapped
 from palpate.uncertainty import (
     NORMAL_95,
@@ -90,18 +90,16 @@ class ModulusRegion:
     open: bool
 
 
-def image_pairs_of(
-    inversion: Inversion, bounds: Bounds, errors: GridErrors, released: OuterIterate | None = None
-) -> ImagePairs | None:
+def image_pairs_of(inversion: Inversion, bounds: Bounds, errors: GridErrors) -> ImagePairs | None:
     """Of the later images of a converged estimate, where two or more have a minimum alone; else None.
 
-    errors: of the residuals on random grids, see `grid_errors`; released: see `pair_estimates`.
+    errors: of the residuals on random grids, see `grid_errors`.
     """
     mapping = inversion.objective.parameters
     if len(inversion.objective.states) < 2 or not inversion.minimum.converged:
         return None
     scale, names = mapping.scale_kpa, mapping.tissues
-    both = pair_estimates(inversion.objective, inversion.minimum, bounds, errors, released)
+    both = pair_estimates(inversion.objective, inversion.minimum, bounds, errors, inversion.released)
     usable = np.logical_and.reduce([every.converged for every in both])
     if np.count_nonzero(usable) < 2:
         return None

@@ -99,11 +99,10 @@ def estimates_of(
     covariance: Covariance,
     *,
     truth: Mapping[str, float],
-    layers_told: bool = True,
 ) -> tuple[ModulusEstimate, ...]:
     """What is stated of the moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known.
 
-    layers_told: whether the covariance holds what layers round organs would do; where it does not, nothing is
+    Where the covariance lacks what layers round organs would do, as the inversion is `unsettled`, nothing is
     `identified`.
     """
     mapping, scale = inversion.objective.parameters, inversion.objective.parameters.scale_kpa
@@ -135,7 +134,7 @@ def estimates_of(
             if ratio_word not in (NOT_IDENTIFIED, word):
                 left = "the range of the known modulus leaves more of it open in kPa"
                 word, why = "ratio only", f"of the ratio {ratio_why}; {left}"
-        if not layers_told and word != NOT_IDENTIFIED:
+        if inversion.unsettled and word != NOT_IDENTIFIED:
             word = "weak" if word == "identified" else word
             why = f"{why}, but does not hold what layers round the organs would do (warning `unsettled`)"
         points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)

@@ -2,9 +2,11 @@
 
 from palpate.unknowns.blocks import FIELD as FIELD
 from palpate.unknowns.blocks import KNOWN_MODULUS as KNOWN_MODULUS
+from palpate.unknowns.blocks import LAYER as LAYER
 from palpate.unknowns.blocks import Acts as Acts
 from palpate.unknowns.blocks import Block as Block
 from palpate.unknowns.blocks import frame_blocks as frame_blocks
+from palpate.unknowns.blocks import in_series as in_series
 from palpate.unknowns.blocks import instrument_block as instrument_block
 from palpate.unknowns.blocks import known_modulus_blocks as known_modulus_blocks
 from palpate.unknowns.blocks import layer_blocks as layer_blocks

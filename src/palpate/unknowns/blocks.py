@@ -30,7 +30,7 @@ STILL, MOVES = 0.02, (1.0, 2.0)  # amplitudes of a frame that stands still, time
 STILL_RIGID, MOVED_RIGID = 0.005, 0.2
 DRAWN_ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often not
 KNOWN_MODULUS, FRAME = "known modulus", "frame"
-FIELD = "field"
+FIELD, LAYER = "field", "layer"
 LEFT_OUT, LEFT_OUT_OF_MAP = 1.0, 0.3  # see `Block.left_out`; what is left out of a map is missing in it
 FIELD_AMPLITUDES = (1.0, 2.0)  # of a tissue that is mapped, times the standard deviation stated
 CONSIDERED = 1e8  # times its precision: an unknown that is considered does not move
@@ -253,7 +253,7 @@ def layer_blocks(
     return tuple(
         Block(
             organ,
-            "layer",
+            LAYER,
             Acts.MODULI,
             states,
             np.full((1, 1), sd**-2.0),

@@ -310,7 +310,8 @@ class ParameterMap:
             if block.released:
                 own = self.columns(i) - n
                 precision[np.ix_(own, own)] = block.precision
-        return replace(self, nuisance_precision=precision)
+        blocks = tuple(replace(block, released=False) for block in self.blocks)
+        return replace(self, blocks=blocks, nuisance_precision=precision)
 
     def with_prior(self, mean: NDArray[np.float64], sd: NDArray[np.float64]) -> ParameterMap:
         """The same with a normal prior of theta: mean and standard deviation (n_parameters,), inf where it is flat.

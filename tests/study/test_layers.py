@@ -1,0 +1,111 @@
+"""Layers round organs: found where the images tell of them, in the interval alone where they do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate.inversion import InverseProblem, LaterState, invert
+from palpate.mechanics.boundary import outer_constraint
+from palpate.mechanics.linear_model import linear_model
+from palpate.mesh.layers import layer_thickness_mm, layered_space, layers_round_organs
+from palpate.observation.noise_model import NoiseModel
+from palpate.observation.observed_surface import observed_surface
+from palpate.observation.prescribed_motion import prescribed_motion
+from palpate.observation.surface_distance import surface_distance
+from palpate.phantoms.scene import Scene
+from palpate.study.discrepancy import discrepancy_findings, discrepancy_of, fitted_materials
+from palpate.uncertainty import FittedState
+from palpate.unknowns import in_series, layer_blocks, parameter_map, unit_blocks
+from palpate_validation.truth import exact_target
+
+SHARP = NoiseModel(np.array([1e-4]), np.array([3.0]))
+SOFT = -3.0  # ln E of a layer over its tissue's: a twentieth
+THICK_MM = 3.0
+
+
+def estimated(twins, twin, of_gland: float):
+    """The estimate, with its truth, of a twin whose gland lies in a layer with such ln E over its tissue's."""
+    plain, coefficients = twin.model.space, twin.coefficients
+    layers = layers_round_organs(plain.mesh)
+    space = layered_space(plain, layers)
+    motion = prescribed_motion(space, {}, n_modes=12, kernel_mm=12.0, prior_mm=twins.WALL_MM)
+    given = {"modes": motion.modes, "offset": motion.offset, "prescribed": motion.prescribed}
+    model = linear_model(space, outer_constraint(space, outer="fixed", **given))
+    numbered = enumerate(layers, start=len(plain.mesh.tissues))
+    round_organs = [
+        (
+            plain.mesh.tissues[layer.organ].name,
+            (model.regions.index(number),),
+            layer_thickness_mm(plain.mesh, layers, layer.organ),
+        )
+        for number, layer in numbered
+    ]
+    blocks = (*unit_blocks(model.n_modes), *layer_blocks(round_organs, (0,), sd=1.5, thickness_mm=THICK_MM))
+    mapping = parameter_map(space.mesh.tissues, model.regions, blocks)
+    truth = np.concatenate([twin.unknowns, [of_gland, 0.0]])
+    displacement = model.solve(mapping.moduli(truth), coefficients).displacement
+    scene = Scene(space, displacement, twin.scene.before, twin.scene.after, {}, 0)
+    surfaces = [observed_surface(space, tissue) for tissue in range(3)]
+    seen = tuple(surface_distance(exact_target(scene, surface), stated_noise=SHARP) for surface in surfaces)
+    problem = InverseProblem((LaterState(model, seen),), mapping)
+    return invert(problem, twins.settings(0.5, 2.0), progress=twins.silent), truth
+
+
+def discrepancy(inversion):
+    """What it found beside the moduli."""
+    state = inversion.objective.states[0]
+    moduli = inversion.objective.parameters.moduli(inversion.minimum.unknowns)
+    (coefficients,) = inversion.objective.parameters.coefficients(inversion.minimum.unknowns)
+    grid = state.observations[0].target.voxels
+    assert grid is None
+    moved = state.displacement(moduli, coefficients)
+    return discrepancy_of(inversion, (FittedState(state.model.space, moved, None, None),))
+
+
+@pytest.fixture(scope="module")
+def sheathed(twins, twin):
+    return estimated(twins, twin, SOFT)
+
+
+@pytest.fixture(scope="module")
+def bonded(twins, twin):
+    return estimated(twins, twin, 0.0)
+
+
+def test_a_soft_layer_is_found_with_the_organ_in_it(sheathed):
+    inversion, truth = sheathed
+    assert inversion.minimum.converged
+    assert inversion.released is None
+    assert inversion.minimum.unknowns[:2] == pytest.approx(truth[:2], abs=0.05)
+    assert inversion.minimum.unknowns[-2] == pytest.approx(SOFT, abs=0.3)
+
+
+def test_without_a_layer_the_estimate_has_none(bonded):
+    """The one with layers free stands beside it, for the interval."""
+    inversion, truth = bonded
+    assert inversion.minimum.converged
+    assert inversion.minimum.unknowns[:2] == pytest.approx(truth[:2], abs=0.02)
+    assert inversion.minimum.unknowns[-2:] == pytest.approx(0.0, abs=1e-5)
+    assert inversion.released is not None
+    assert not any(block.released for block in inversion.released.objective.parameters.blocks)
+    assert discrepancy(inversion).layers == ()
+
+
+def test_a_layer_is_said_in_words_and_stands_in_the_material(sheathed):
+    inversion, _ = sheathed
+    found = discrepancy(inversion)
+    gland, sac = found.layers
+    assert (gland.tissue, sac.tissue) == ("gland", "sac")
+    assert gland.interval95[0] < np.exp(SOFT) < gland.interval95[1]
+    assert (gland.told, sac.told) == (True, False)
+    (finding,) = [finding for finding in discrepancy_findings(found) if finding.code == "layer"]
+    assert f"round 'gland' lies a layer that is {gland.ratio:.2g} times as stiff" in finding.message
+    (material,) = fitted_materials(inversion)
+    mesh, parameters = inversion.objective.states[0].model.space.mesh, inversion.objective.parameters
+    first = next(block for block in parameters.blocks if block.of == "gland" and block.cause == "layer")
+    inside = mesh.region == inversion.objective.states[0].model.regions[first.regions[0]]
+    expected = in_series(np.log([gland.ratio]), np.array([first.share]))
+    assert material.log_ratio[inside] == pytest.approx(float(expected[0]))
+    elsewhere = material.log_ratio[mesh.region < 4]
+    assert np.all(elsewhere == 0.0)
