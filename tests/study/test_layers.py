@@ -15,6 +15,7 @@ from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.observation.surface_distance import surface_distance
 from palpate.phantoms.scene import Scene
 from palpate.study.discrepancy import discrepancy_findings, discrepancy_of, fitted_materials
+from palpate.study.estimation import Observed, conclude, stated_posteriors
 from palpate.uncertainty import FittedState
 from palpate.unknowns import in_series, layer_blocks, parameter_map, unit_blocks
 from palpate_validation.truth import exact_target
@@ -52,15 +53,16 @@ def estimated(twins, twin, of_gland: float):
     return invert(problem, twins.settings(0.5, 2.0), progress=twins.silent), truth
 
 
-def discrepancy(inversion):
-    """What it found beside the moduli."""
-    state = inversion.objective.states[0]
-    moduli = inversion.objective.parameters.moduli(inversion.minimum.unknowns)
-    (coefficients,) = inversion.objective.parameters.coefficients(inversion.minimum.unknowns)
-    grid = state.observations[0].target.voxels
-    assert grid is None
-    moved = state.displacement(moduli, coefficients)
-    return discrepancy_of(inversion, (FittedState(state.model.space, moved, None, None),))
+def fitted(inversion, twin):
+    """The later state as the estimate has it."""
+    state, parameters, unknowns = (
+        inversion.objective.states[0],
+        inversion.objective.parameters,
+        inversion.minimum.unknowns,
+    )
+    (coefficients,) = parameters.coefficients(unknowns)
+    moved, grid = state.displacement(parameters.moduli(unknowns), coefficients), twin.scene.before.grid
+    return FittedState(state.model.space, moved, grid, grid)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +83,7 @@ def test_a_soft_layer_is_found_with_the_organ_in_it(sheathed):
     assert inversion.minimum.unknowns[-2] == pytest.approx(SOFT, abs=0.3)
 
 
-def test_without_a_layer_the_estimate_has_none(bonded):
+def test_without_a_layer_the_estimate_has_none(bonded, twin):
     """The one with layers free stands beside it, for the interval."""
     inversion, truth = bonded
     assert inversion.minimum.converged
@@ -89,12 +91,27 @@ def test_without_a_layer_the_estimate_has_none(bonded):
     assert inversion.minimum.unknowns[-2:] == pytest.approx(0.0, abs=1e-5)
     assert inversion.released is not None
     assert not any(block.released for block in inversion.released.objective.parameters.blocks)
-    assert discrepancy(inversion).layers == ()
+    assert discrepancy_of(inversion, (fitted(inversion, twin),)).layers == ()
 
 
-def test_a_layer_is_said_in_words_and_stands_in_the_material(sheathed):
+def test_an_interval_holds_the_organ_in_its_layer(sheathed, twin, twins):
+    """One posterior stands behind it, for the organ without its layer is less likely by far."""
+    inversion, truth = sheathed
+    observed = Observed((fitted(inversion, twin),), (None,))
+    result = conclude(inversion, twins.settings(2.0), observed, truth={}, seed=1)
+    for estimate, theta in zip(result.estimates, truth, strict=False):
+        low, high = estimate.interval95
+        assert low < 10.0 * np.exp(theta) < high
+        assert estimate.verdict == "identified"
+    gland, sac = (estimate.variance_shares["layer"] for estimate in result.estimates)
+    assert gland > sac > 0.0
+    _, posteriors = stated_posteriors(inversion, result.covariance)
+    assert len(posteriors) == 1
+
+
+def test_a_layer_is_said_in_words_and_stands_in_the_material(sheathed, twin):
     inversion, _ = sheathed
-    found = discrepancy(inversion)
+    found = discrepancy_of(inversion, (fitted(inversion, twin),))
     gland, sac = found.layers
     assert (gland.tissue, sac.tissue) == ("gland", "sac")
     assert gland.interval95[0] < np.exp(SOFT) < gland.interval95[1]
