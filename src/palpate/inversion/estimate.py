@@ -138,15 +138,16 @@ def with_released(
 ) -> Inversion:
     """The inversion with its best minimum followed on with those blocks free that were held (see `Block.released`).
 
-    Where J, with the same numbers of independent residuals, is then less by more than what is as good, the images tell
-    of what was held, and this is the estimate, followed until it ends by the `rule`. Where it does not end the
-    inversion says why. Nothing changes where there is no such block, or no minimum to follow.
+    Where J, with their prior odds and the same numbers of independent residuals, is then less by more than what is as
+    good, the images tell of what was held, and this is the estimate, followed until it ends by the `rule`. Where it
+    does not end the inversion says why. Nothing changes where there is no such block, or no minimum to follow.
     """
     best = inversion.candidates[inversion.best]
-    held, causes = best.iterate, dict.fromkeys(b.cause for b in inversion.objective.parameters.blocks if b.released)
-    if not held.minimum.converged or not causes:
+    held, released = best.iterate, [block for block in inversion.objective.parameters.blocks if block.released]
+    if not held.minimum.converged or not released:
         return inversion
-    unknowns, title, bounds = held.minimum.unknowns, f"with {' and '.join(causes)} free", settings.bounds
+    unknowns, bounds = held.minimum.unknowns, settings.bounds
+    title = f"with {' and '.join(dict.fromkeys(block.cause for block in released))} free"
     try:
         objective, evaluation = held.objective.released(held.minimum.evaluation, unknowns)
         places = objective.linearisation_points(unknowns, evaluation)
@@ -159,6 +160,7 @@ def with_released(
     if not free.minimum.converged:
         return replace(inversion, unsettled=free.minimum.outcome.value)
     gain = held.objective.total(held.minimum.evaluation) - total_counted_as(free, held)
+    gain += min(block.released_odds for block in released)
     if gain <= AS_GOOD:
         return inversion
     start = replace(free, minimum=replace(free.minimum, evaluations=0))

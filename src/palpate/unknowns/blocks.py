@@ -38,6 +38,7 @@ CONSIDERED = 1e8  # times its precision: an unknown that is considered does not 
 # homogeneous is 3 to 10, by how much as likely the one as the other
 PATCHINESS: tuple[float, ...] = (1.0 / 3.0, 1.0, 2.0)
 PATCHY_ODDS = (0.0, -1.9, -1.9)
+LAYER_ODDS = -1.9  # log prior odds that layers differ from their tissue, as seldom as a tissue is patchy
 
 
 class Acts(Enum):
@@ -62,12 +63,12 @@ class Block:
     last: its prior is learned where the estimate has converged under those of the others; before it would take what
     they explain, or leave it to them. rivals: causes that explain as much as its last alternative, which is none where
     a block of theirs has left its first one. released: held at 0 as well while an estimate is sought, and free under P
-    where its interval is. left_out: variances of the first noise, a tenth of the found one, that what is left out of
-    the unknowns may explain (see `informed_problem`); below 0 none is. regions: numbers of the model's regions whose
-    moduli it multiplies, one unknown x for all of them, where it acts on moduli: a `share` s of each, in series with
-    the rest of it, is e^x times as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is
-    believed where that is not normal; an estimate begins with P then. Raises `ConfigurationError` for terms of another
-    size.
+    where its interval is, and in the estimate where that is likelier, by log prior odds of `released_odds`. left_out:
+    variances of the first noise, a tenth of the found one, that what is left out of the unknowns may explain (see
+    `informed_problem`); below 0 none is. regions: numbers of the model's regions whose moduli it multiplies, one
+    unknown x for all of them, where it acts on moduli: a `share` s of each, in series with the rest of it, is e^x times
+    as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is believed where that is not normal;
+    an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
     """
 
     of: str
@@ -82,6 +83,7 @@ class Block:
     last: bool = False
     rivals: tuple[str, ...] = ()
     released: bool = False
+    released_odds: float = 0.0
     unit_mm: float = 1.0
     regions: tuple[int, ...] = ()
     share: float = 1.0
@@ -258,6 +260,7 @@ def layer_blocks(
             states,
             np.full((1, 1), sd**-2.0),
             released=True,
+            released_odds=LAYER_ODDS,
             regions=regions,
             share=min(thickness_mm / h, 1.0),
         )
