@@ -38,7 +38,7 @@ import palpate
 Result = dict[str, Any]  # a line of JSON
 Key = tuple[str, int, str, float, tuple[str, ...]]
 
-TOLD = ("alignment", "frame", "offsets", "heterogeneity", "layers")  # of result.json, where a version of the program has them
+TOLD = ("alignment", "frame", "offsets", "heterogeneity", "layers")  # of result.json, where a version has them
 INTERVALS = ("interval95", "interval95_given_model")
 OUT = 2.0  # half-widths
 

@@ -58,7 +58,7 @@ def invert(
 
     States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle start
     and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows ends near.
-    At last blocks are `released` that were held.
+    At last blocks that were held are released, see `with_released`.
     Raises `ConfigurationError` for an open Poisson's ratio with another law, `EstimationError`s of solving; an estimate
     that did not converge says so in its minimum's outcome.
     """
