@@ -67,6 +67,7 @@ def test_moduli_that_depend_on_each_other_are_one_warning_with_every_pair():
         objective=Stand(parameters=Stand(absolute=True, tissues=names, names=names)),
         minimum=Stand(converged=True),
         convergence=Stand(unmet=()),
+        unsettled="",
         candidates=[Stand(minimum=Stand(outcome=None))],
     )
     sd = np.array([0.1, 0.2, 0.5])
