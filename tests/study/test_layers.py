@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
+from itertools import count
+
 import numpy as np
 import pytest
 
-from palpate.inversion import InverseProblem, LaterState, invert
+from palpate.errors import NotConverged
+from palpate.inversion import InverseProblem, LaterState, Outcome, invert, minimised
+from palpate.inversion.estimate import with_released
+from palpate.inversion.trust_region import NEAR
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.layers import layer_thickness_mm, layered_space, layers_round_organs
@@ -17,16 +24,17 @@ from palpate.phantoms.scene import Scene
 from palpate.study.discrepancy import discrepancy_findings, discrepancy_of, fitted_materials
 from palpate.study.estimation import Observed, conclude, stated_posteriors
 from palpate.uncertainty import FittedState
-from palpate.unknowns import in_series, layer_blocks, parameter_map, unit_blocks
+from palpate.unknowns import layer_blocks, parameter_map, unit_blocks
 from palpate_validation.truth import exact_target
 
 SHARP = NoiseModel(np.array([1e-4]), np.array([3.0]))
 SOFT = -3.0  # ln E of a layer over its tissue's: a twentieth
 THICK_MM = 3.0
+REST = 3  # number of the tissue round both organs, after which those of the layers come
 
 
-def estimated(twins, twin, of_gland: float):
-    """The estimate, with its truth, of a twin whose gland lies in a layer with such ln E over its tissue's."""
+def posed(twins, twin, of_gland: float):
+    """The problem, with its truth, of a twin whose gland lies in a layer with such ln E over its tissue's."""
     plain, coefficients = twin.model.space, twin.coefficients
     layers = layers_round_organs(plain.mesh)
     space = layered_space(plain, layers)
@@ -49,8 +57,7 @@ def estimated(twins, twin, of_gland: float):
     scene = Scene(space, displacement, twin.scene.before, twin.scene.after, {}, 0)
     surfaces = [observed_surface(space, tissue) for tissue in range(3)]
     seen = tuple(surface_distance(exact_target(scene, surface), stated_noise=SHARP) for surface in surfaces)
-    problem = InverseProblem((LaterState(model, seen),), mapping)
-    return invert(problem, twins.settings(0.5, 2.0), progress=twins.silent), truth
+    return InverseProblem((LaterState(model, seen),), mapping), truth
 
 
 def fitted(inversion, twin):
@@ -65,6 +72,11 @@ def fitted(inversion, twin):
     return FittedState(state.model.space, moved, grid, grid)
 
 
+def estimated(twins, twin, of_gland: float):
+    problem, truth = posed(twins, twin, of_gland)
+    return invert(problem, twins.settings(0.5, 2.0), progress=twins.silent), truth
+
+
 @pytest.fixture(scope="module")
 def sheathed(twins, twin):
     return estimated(twins, twin, SOFT)
@@ -73,6 +85,15 @@ def sheathed(twins, twin):
 @pytest.fixture(scope="module")
 def bonded(twins, twin):
     return estimated(twins, twin, 0.0)
+
+
+@pytest.fixture(scope="module")
+def held(twins, twin):
+    """That with a sheath, before its layers are free."""
+    problem, _ = posed(twins, twin, SOFT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys.modules["palpate.inversion.estimate"], "with_released", lambda found, *_a, **_o: found)
+        return invert(problem, twins.settings(2.0), progress=twins.silent)
 
 
 def test_a_soft_layer_is_found_with_the_organ_in_it(sheathed):
@@ -119,10 +140,35 @@ def test_a_layer_is_said_in_words_and_stands_in_the_material(sheathed, twin):
     (finding,) = [finding for finding in discrepancy_findings(found) if finding.code == "layer"]
     assert f"round 'gland' lies a layer that is {gland.ratio:.2g} times as stiff" in finding.message
     (material,) = fitted_materials(inversion)
-    mesh, parameters = inversion.objective.states[0].model.space.mesh, inversion.objective.parameters
-    first = next(block for block in parameters.blocks if block.of == "gland" and block.cause == "layer")
-    inside = mesh.region == inversion.objective.states[0].model.regions[first.regions[0]]
-    expected = in_series(np.log([gland.ratio]), np.array([first.share]))
-    assert material.log_ratio[inside] == pytest.approx(float(expected[0]))
-    elsewhere = material.log_ratio[mesh.region < 4]
-    assert np.all(elsewhere == 0.0)
+    model, parameters = inversion.objective.states[0].model, inversion.objective.parameters
+    moduli = dict(zip(model.regions, parameters.moduli(inversion.minimum.unknowns), strict=True))
+    layers = [number for number in model.regions if number > REST]
+    for number in (REST, *layers):
+        inside = model.space.mesh.region == number
+        assert np.exp(material.log_ratio[inside]) == pytest.approx(moduli[number] / moduli[REST])
+    assert np.all(material.log_ratio[model.space.mesh.region <= REST] == 0.0)
+
+
+def lost(*_arguments, **_options):
+    raise NotConverged("no equilibrium")
+
+
+def unfinished(*arguments, **options):
+    end = minimised(*arguments, **options)
+    return replace(end, minimum=replace(end.minimum, outcome=Outcome.STEPS))
+
+
+@pytest.mark.parametrize("ending", [lost, unfinished])
+@pytest.mark.parametrize("followed", [0, 1])
+def test_an_estimate_that_cannot_be_followed_with_layers_free_says_so(held, twins, monkeypatch, ending, followed):
+    """At first, or where it is likelier so: it is the one with layers held, and no such thing passes for settled."""
+    calls = count()
+    monkeypatch.setattr(
+        sys.modules["palpate.inversion.estimate"],
+        "minimised",
+        lambda *a, **o: ending(*a, **o) if next(calls) == followed else minimised(*a, **o),
+    )
+    found = with_released(held, twins.settings(2.0), progress=twins.silent, rule=NEAR)
+    assert found.minimum is held.minimum
+    assert found.unsettled == ("no equilibrium" if ending is lost else Outcome.STEPS.value)
+    assert (found.released is None) == (ending is lost and followed == 0)

@@ -153,31 +153,26 @@ def with_released(
         places = objective.linearisation_points(unknowns, evaluation)
         near = [known.update(place) for known, place in zip(objective.approximations, places, strict=True)]
         start = replace(begun(objective.under(near), unknowns), checks=held.checks)
-        free = minimised(start, bounds, NEAR, progress=progress, title=title)
+        end = free = minimised(start, bounds, NEAR, progress=progress, title=title)
+        inversion = replace(_followed(inversion, held, free), released=free)
+        gain = held.objective.total(held.minimum.evaluation) - total_counted_as(free, held)
+        gain += min(block.released_odds for block in released)
+        if free.minimum.converged and gain > AS_GOOD:
+            start = replace(free, minimum=replace(free.minimum, evaluations=0))
+            end = minimised(start, bounds, rule, progress=progress, title=title)
+            end = _at_equilibrium(end, ()) if inversion.objective.states[0].finite_strain else end
+            inversion = _followed(inversion, free, end)
     except EstimationError as error:
         return replace(inversion, unsettled=str(error))
-    inversion = replace(_followed(inversion, held, free), released=free)
-    if not free.minimum.converged:
-        return replace(inversion, unsettled=free.minimum.outcome.value)
-    gain = held.objective.total(held.minimum.evaluation) - total_counted_as(free, held)
-    gain += min(block.released_odds for block in released)
-    if gain <= AS_GOOD:
+    if not end.minimum.converged:
+        return replace(inversion, unsettled=end.minimum.outcome.value)
+    if end is free:
         return inversion
-    start = replace(free, minimum=replace(free.minimum, evaluations=0))
-    try:
-        end = minimised(start, bounds, rule, progress=progress, title=title)
-        end = _at_equilibrium(end, ()) if inversion.objective.states[0].finite_strain else end
-    except EstimationError as error:
-        progress(f"{title}: likelier by {gain:.1f}, but not followed to its end: {error}")
-        return inversion
-    inversion = _followed(inversion, free, end)
-    if end.minimum.converged:
-        history = (*held.minimum.history, *free.minimum.history[1:], *end.minimum.history[1:])
-        end = replace(end, minimum=replace(end.minimum, history=history))
-        candidates = list(inversion.candidates)
-        candidates[inversion.best] = replace(best, iterate=end, value=best.value - gain)
-        inversion = replace(inversion, candidates=tuple(candidates), released=None)
-    return inversion
+    history = (*held.minimum.history, *free.minimum.history[1:], *end.minimum.history[1:])
+    end = replace(end, minimum=replace(end.minimum, history=history))
+    candidates = list(inversion.candidates)
+    candidates[inversion.best] = replace(best, iterate=end, value=best.value - gain)
+    return replace(inversion, candidates=tuple(candidates), released=None)
 
 
 def _followed(inversion: Inversion, before: OuterIterate, after: OuterIterate) -> Inversion:

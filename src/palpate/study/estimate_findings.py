@@ -46,7 +46,7 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
             Finding(
                 "unsettled",
                 f"with the stiffness of layers round organs free the estimate did not end ({inversion.unsettled}), so"
-                " that the intervals do not hold what a soft or stiff layer would do; another [mesh] edge_length_mm may"
+                " that intervals may not hold what a soft or stiff layer would do; another [mesh] edge_length_mm may"
                 " help, or [discrepancy] layer_sd = 0 where there is none",
             )
         )
