@@ -280,9 +280,9 @@ def total_counted_as(iterate: OuterIterate, other: OuterIterate) -> float:
     return objective.total(LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns))
 
 
-def _numbers(objective: Objective) -> tuple[int, ...]:
-    """Those of the alternatives chosen for the blocks, 0 where a block has none, or no choice yet."""
-    return tuple(number or 0 for number in objective.chosen)
+def _numbers(objective: Objective) -> tuple[int | None, ...]:
+    """Those of the alternatives chosen for the blocks, None where a block has none, or no choice yet."""
+    return objective.chosen or (None,) * len(objective.parameters.blocks)
 
 
 def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, fixed: bool) -> _Step:

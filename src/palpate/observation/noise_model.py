@@ -17,12 +17,10 @@ from palpate.observation.jacobian import Jacobian
 from palpate.parallel import mapped
 
 LENGTHS = (0.5, 0.8, 1.2, 2.0, 3.0, 4.5, 6.5, 9.5, 14.0)  # mm
-CELL = 1.0  # mm: residuals nearer than that are averaged before they are compared
-MAX_CELLS = 2500
+CELL, FAR_CELL = 1.0, 3.0  # mm: residuals nearer than that are averaged before they are compared
 CELLS = 2**20  # along an axis, before they are counted from 0 again
-ROWS = 256  # of the pairs' table at once: it stays in the cache
-REACH = 28.0  # mm
-BINS = 1 + int(REACH)  # of a cell with itself, then of 1 mm each
+NEAR, REACH = 8, 28  # mm: from here on those of larger cells are compared, up to there any
+BINS = 1 + REACH  # of a cell with itself, then of 1 mm each
 FLOOR = 1e-3  # mm: no surface in an image is known better
 SMOOTH = 4.0  # mm: errors that are correlated over less are hardly taken for motion
 CUTOFF = 3.5  # correlation lengths, beyond which errors are taken for independent
@@ -158,7 +156,7 @@ class _Pairs:
     @classmethod
     def of(cls, places: NDArray[np.float64], normals: NDArray[np.float64], jacobian: Jacobian) -> _Pairs:
         """Of residuals at places (n, 3) mm with normals (n, 3) and a Jacobian (n, n_unknowns)."""
-        cells = _cell_means(places, RESPONSE_CELLS)
+        cells = _some_cell_means(places, RESPONSE_CELLS)
         centres, mean_normals = _times(cells, places), _units(_times(cells, normals))
         apart = cdist(centres, centres)
         near = apart < REACH
@@ -205,37 +203,56 @@ def _binned_products(
 ) -> NDArray[np.float64]:
     """Sums (4, n_bins) over pairs of cells, those of a cell with itself first: r_i r_j n_i.n_j, (n_i.n_j)^2, mm, 1.
 
-    A cell (1 mm; at most 2500 of them) stands for the means of its residuals, places and normals.
+    A cell stands for the means of its residuals, places and normals: of 1 mm for pairs less than 8 mm apart; of 3 mm
+    for others, which so short a way makes no different, each as often as it has cells of 1 mm.
     """
-    cells = _cell_means(places, MAX_CELLS)
+    cells = _cell_means(places, CELL)
     mean, centre, normal = _times(cells, values), _times(cells, places), _units(_times(cells, normals))
-    sums = np.zeros((4, BINS))
-    for start in range(0, len(mean), ROWS):
-        rows, others = slice(start, start + ROWS), slice(start, None)
-        distance = cdist(centre[rows], centre[others])
-        once = np.triu(distance < REACH)  # a pair of different cells once, then counted twice
-        apart = distance[once]
-        bins = _bins(apart)
-        cosine = (normal[rows] @ normal[others].T)[once]
-        terms = (np.outer(mean[rows], mean[others])[once] * cosine, cosine**2, apart, np.ones_like(apart))
-        sums += np.stack([np.bincount(bins, term, minlength=BINS) for term in terms])
-    return sums * np.where(np.arange(BINS) > 0, 2.0, 1.0)
+    near = _pair_sums(mean, centre, normal, np.ones(len(mean)), (0, NEAR))
+    cells, count = _cell_means(centre, FAR_CELL), np.bincount(_cell_keys(centre, FAR_CELL)[1])
+    far = _times(cells, mean), _times(cells, centre), _units(_times(cells, normal))
+    sums = near + _pair_sums(*far, count.astype(np.float64), (NEAR, REACH))
+    sums[:, 0] = mean @ mean, len(mean), 0.0, len(mean)
+    return sums
 
 
-def _cell_means(places: NDArray[np.float64], most: int) -> sparse.csr_matrix[np.float64]:
-    """Means (n_cells, n) over what lies in each cell of 1 mm, places (n, 3) mm; of so many cells at the most.
+def _pair_sums(
+    values: NDArray[np.float64],
+    centres: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    counts: NDArray[np.float64],
+    between: tuple[int, int],
+) -> NDArray[np.float64]:
+    """What `_binned_products` has of different cells so far apart (mm), each of which stands for `counts` (n_cells,).
 
-    Cells are chosen by numbers that follow from their keys but without order (the finaliser of SplitMix64; Steele et
+    values (n_cells,) mm, centres (n_cells, 3) mm, normals (n_cells, 3). A pair counts twice.
+    """
+    i, j = cKDTree(centres).query_pairs(between[1], output_type="ndarray").T
+    apart = np.linalg.norm(centres[i] - centres[j], axis=1)
+    i, j, apart = (of[apart >= between[0]] for of in (i, j, apart))
+    cosine, count = np.einsum("na,na->n", normals[i], normals[j]), counts[i] * counts[j]
+    terms = (values[i] * values[j] * cosine, cosine**2, apart, np.ones_like(apart))
+    return np.stack([2.0 * np.bincount(_bins(apart), count * term, minlength=BINS)[:BINS] for term in terms])
+
+
+def _cell_means(places: NDArray[np.float64], size: float) -> sparse.csr_matrix[np.float64]:
+    """Means (n_cells, n) over what lies in each cube of edge `size` (mm), places (n, 3) mm."""
+    inverse = _cell_keys(places, size)[1]
+    shares = 1.0 / np.bincount(inverse)[inverse]
+    return sparse.csr_matrix((shares, (inverse, np.arange(len(inverse)))))
+
+
+def _some_cell_means(places: NDArray[np.float64], most: int) -> sparse.csr_matrix[np.float64]:
+    """Those of cells of 1 mm, but of so many of them at the most.
+
+    They are chosen by numbers that follow from their keys but without order (the finaliser of SplitMix64; Steele et
     al. 2014): they stay chosen when others come and go, so that the fit does not jump as a surface moves.
     """
-    keys, inverse = _cell_keys(places, CELL)
-    shares = 1.0 / np.bincount(inverse)[inverse]
-    mixed = keys.astype(np.uint64)
+    mixed = _cell_keys(places, CELL)[0].astype(np.uint64)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
     chosen = np.sort(np.argsort(mixed ^ (mixed >> np.uint64(31)), kind="stable")[:most])
-    every: sparse.csr_matrix[np.float64] = sparse.csr_matrix((shares, (inverse, np.arange(len(inverse)))))
-    return sparse.csr_matrix(every[chosen])
+    return sparse.csr_matrix(_cell_means(places, CELL)[chosen])
 
 
 def _times(

@@ -175,7 +175,7 @@ class SurfaceDistance:
         if self.stated_noise is not None:
             return self.stated_noise
         return fit_noise_model(
-            [r.values for r in residuals], [r.places for r in residuals], [r.normals for r in residuals], response
+            [r.values for r in residuals], [r.material for r in residuals], [r.normals for r in residuals], response
         )
 
     def imaging_error(self, residuals: Residuals, before: Segmentation, after: Segmentation) -> NDArray[np.float64]:

@@ -291,7 +291,7 @@ def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
         response = FitResponse(
             jacobians,
             gains,
-            places=[lines[i].residuals.places for i in own],
+            places=[lines[i].residuals.material for i in own],
             normals=[lines[i].residuals.normals for i in own],
         )
         found[key] = lines[own[0]].observation.fitted_noise([lines[i].residuals for i in telling], response)

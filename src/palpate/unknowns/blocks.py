@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,18 +128,16 @@ def unit_blocks(*n_modes: int) -> tuple[Block, ...]:
 
 
 def wall_blocks(wall: Wall, state: int, *, learned: bool = True) -> tuple[Block, ...]:
-    """The motion of a driver's wall in a later state: a drift and a swelling (see `Wall`), and what is finer.
+    """The motion of a driver's wall in a later state: drifts, swellings (see `Wall`), and what is finer.
 
-    The amplitudes of all three are learned together: what one explains the others need not, and in turn whichever was
-    learned first would keep it.
+    The amplitudes of all are learned together: what one explains the others need not, and in turn whichever was learned
+    first would keep it. All lengths are terms of one covariance: as alternatives two may be as good, and which one is
+    taken would hang on the way.
     """
     n, m = len(wall.columns), wall.n_fine
-    fine = (np.diag(np.repeat([0.0, 1.0], [n, m])),) if m else ()
-    families = tuple(
-        (*(linalg.block_diag(of, np.zeros((m, m))) for of in family), *fine)
-        for family in product(wall.drifts, wall.swellings)
-    )
-    block = Block(wall.name, "driver", Acts.BOUNDARY, (state,), np.eye(n + m), families if learned else ())
+    terms = [linalg.block_diag(of, np.zeros((m, m))) for of in (*wall.drifts, *wall.swellings)]
+    terms += [np.diag(np.repeat([0.0, 1.0], [n, m]))] if m else []
+    block = Block(wall.name, "driver", Acts.BOUNDARY, (state,), np.eye(n + m), (tuple(terms),) if learned else ())
     return (block,) if n + m else ()
 
 
