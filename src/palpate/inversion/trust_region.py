@@ -348,15 +348,22 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
     n, unknowns = step.objective.n_parameters, step.minimum.unknowns
     objective = step.objective.rematched(unknowns)
     minimum, spent = replace(step.minimum, evaluation=objective(unknowns), outcome=Outcome.STEPS), 1
-    tolerance = rule.tolerance(minimum, n)
-    taken, matrix = unknowns - now.minimum.unknowns, minimum.evaluation.matrix
-    onward = newton_step(minimum.evaluation, bounds.free(unknowns, minimum.evaluation.score, fixed), n)
-    along = float(taken @ matrix @ onward) / max(float(taken @ matrix @ taken), 1e-30)
-    steps = [taken, onward] if step.cut else [taken]
-    if not step.cut and along > 0.0 and step.total(minimum.evaluation) >= step.now:
-        steps = [onward - along * taken]
-    size = max(float(np.max(np.abs(d[:n]) / tolerance, initial=0.0)) for d in steps)
-    wanted = size
+    tolerance, taken = rule.tolerance(minimum, n), unknowns - now.minimum.unknowns
+
+    def steps_left(seen: Evaluation) -> tuple[list[NDArray[np.float64]], bool]:
+        """The steps (n_unknowns,) that must be short, by an evaluation at the end; whether they are what is across."""
+        onward = newton_step(seen, bounds.free(unknowns, seen.score, fixed), n)
+        along = float(taken @ seen.matrix @ onward) / max(float(taken @ seen.matrix @ taken), 1e-30)
+        if not step.cut and along > 0.5 and step.total(seen) >= step.now:
+            return [onward - along * taken], True
+        return [taken, onward] if step.cut else [taken], False
+
+    def size_of(steps: Sequence[NDArray[np.float64]]) -> float:
+        """The furthest that one of them moves a log-modulus, over what it may."""
+        return max(float(np.max(np.abs(d[:n]) / tolerance, initial=0.0)) for d in steps)
+
+    steps, _ = steps_left(minimum.evaluation)
+    wanted = size = size_of(steps)
     if np.isfinite(rule.coefficients):
         decrement = max(0.5 * float(d @ now.minimum.evaluation.matrix @ d) for d in steps)
         wanted = max(0.0 if np.isinf(rule.step_sd) else size, decrement / (rule.coefficients * len(unknowns)))
@@ -374,6 +381,9 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
         pairs = zip(objective.approximations, places, strict=True)
         objective = objective.under([approximation.update(place) for approximation, place in pairs])
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
+        steps, across = steps_left(minimum.evaluation)
+        if across and rule.derivatives:  # by a model that is exact there
+            wanted, left, missing = size_of(steps), 0.0, 0.0
     there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals)
     return replace(there, correlated=correlated), spent
 
