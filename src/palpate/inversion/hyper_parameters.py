@@ -365,6 +365,7 @@ def _most_evident(
 
     limits = np.log(block.amplitudes)
     start = np.zeros(len(terms)).clip(*limits)
-    best = optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=[tuple(limits)] * len(terms))
+    bounds = [tuple(limits)] * len(terms)
+    best = optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
     squares = np.exp(2.0 * best.x)
     return odds - float(best.fun), sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))

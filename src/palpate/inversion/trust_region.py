@@ -156,6 +156,22 @@ class _Step:
         gain, promised = (-0.5 * float((self.begin.score + end) @ d) for end in ends)
         return max(gain, self.begin.value - there.value), promised
 
+    def remaining(
+        self, unknowns: NDArray[np.float64], there: Evaluation, free: NDArray[np.bool_]
+    ) -> tuple[list[NDArray[np.float64]], bool]:
+        """The steps (n,) by which a minimum may still be missed, of one from unknowns (n,); whether they are across it.
+
+        Of one that the trust region cut it and what is left at its end, -H^-1 s over the `free` unknowns, or what is
+        left alone across it where J is no lower and the score still leads on by more than half of it: errors of the
+        normals pull a wall along itself, always alike, and no residual changes as they promise.
+        """
+        taken, n = self.minimum.unknowns - unknowns, self.objective.n_parameters
+        onward = newton_step(there, free, n)
+        along = float(taken @ there.matrix @ onward) / max(float(taken @ there.matrix @ taken), 1e-30)
+        if not self.cut and along > 0.5 and self.total(there) >= self.now:
+            return [onward - along * taken], True
+        return [taken, onward] if self.cut else [taken], False
+
 
 def minimised(
     start: OuterIterate,
@@ -339,34 +355,26 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
 
 
 def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, fixed: bool) -> tuple[OuterIterate, int]:
-    """The objective at the end of a step, its model made exact there where its error matters; the evaluations spent.
-
-    A step that the trust region cut tells by what is left of it at its end how far away the minimum is, not by its
-    size. So does one after which J is no lower where the score still leads on: by what is left across it. Errors of the
-    normals pull a wall along itself, always alike, and no residual changes as they promise.
-    """
-    n, unknowns = step.objective.n_parameters, step.minimum.unknowns
+    """The objective at the end of a step, its model made exact there where its error matters; the evaluations spent."""
+    n, before, unknowns = step.objective.n_parameters, now.minimum, step.minimum.unknowns
     objective = step.objective.rematched(unknowns)
     minimum, spent = replace(step.minimum, evaluation=objective(unknowns), outcome=Outcome.STEPS), 1
-    tolerance, taken = rule.tolerance(minimum, n), unknowns - now.minimum.unknowns
+    tolerance = rule.tolerance(minimum, n)
 
-    def steps_left(seen: Evaluation) -> tuple[list[NDArray[np.float64]], bool]:
-        """The steps (n_unknowns,) that must be short, by an evaluation at the end; whether they are what is across."""
-        onward = newton_step(seen, bounds.free(unknowns, seen.score, fixed), n)
-        along = float(taken @ seen.matrix @ onward) / max(float(taken @ seen.matrix @ taken), 1e-30)
-        if not step.cut and along > 0.5 and step.total(seen) >= step.now:
-            return [onward - along * taken], True
-        return [taken, onward] if step.cut else [taken], False
-
-    def size_of(steps: Sequence[NDArray[np.float64]]) -> float:
-        """The furthest that one of them moves a log-modulus, over what it may."""
+    def size(steps: Sequence[NDArray[np.float64]]) -> float:
+        """The furthest that one of them (n_unknowns,) moves a log-modulus, over what it may."""
         return max(float(np.max(np.abs(d[:n]) / tolerance, initial=0.0)) for d in steps)
 
-    steps, _ = steps_left(minimum.evaluation)
-    wanted = size = size_of(steps)
+    def remaining() -> tuple[list[NDArray[np.float64]], bool]:
+        """That of the step, by what is known at its end."""
+        seen = minimum.evaluation
+        return step.remaining(before.unknowns, seen, bounds.free(unknowns, seen.score, fixed))
+
+    steps, _ = remaining()
+    wanted = size(steps)
     if np.isfinite(rule.coefficients):
-        decrement = max(0.5 * float(d @ now.minimum.evaluation.matrix @ d) for d in steps)
-        wanted = max(0.0 if np.isinf(rule.step_sd) else size, decrement / (rule.coefficients * len(unknowns)))
+        decrement = max(0.5 * float(d @ before.evaluation.matrix @ d) for d in steps)
+        wanted = max(0.0 if np.isinf(rule.step_sd) else wanted, decrement / (rule.coefficients * len(unknowns)))
     correlated = now.correlated + step.settled
     if np.isinf(rule.model_error):
         there = OuterIterate(objective, minimum, Convergence(wanted, 0.0, 0.0), now.checks, now.totals)
@@ -381,9 +389,9 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
         pairs = zip(objective.approximations, places, strict=True)
         objective = objective.under([approximation.update(place) for approximation, place in pairs])
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
-        steps, across = steps_left(minimum.evaluation)
+        steps, across = remaining()
         if across and rule.derivatives:  # by a model that is exact there
-            wanted, left, missing = size_of(steps), 0.0, 0.0
+            wanted, left, missing = size(steps), 0.0, 0.0
     there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals)
     return replace(there, correlated=correlated), spent
 
