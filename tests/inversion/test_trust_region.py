@@ -74,6 +74,18 @@ def test_which_alternative_is_chosen_does_not_hang_on_the_way(twins, found):
     assert len(set(ends)) == 1
 
 
+def test_what_is_learned_last_has_its_choice_where_an_estimate_ends(twins, found):
+    """Also where that is the first alternative: it would else stay as wide as it was believed to be until then."""
+    coefficients = found.minimum.unknowns[2:]
+    size, n = float(np.sqrt(np.mean(coefficients**2))), len(coefficients)
+    objective = twins.mixture(end_of(found).objective, (size, 20.0 * size), last=True)
+    wide = replace(objective.parameters, nuisance_precision=np.eye(n) / (20.0 * size) ** 2)
+    end = on(found, replace(objective, parameters=wide), twins, CHEAP)
+    assert end.minimum.converged
+    assert end.objective.chosen == (0,)
+    assert end.objective.parameters.nuisance_precision == pytest.approx(np.eye(n) / size**2, rel=0.01)
+
+
 def test_alternatives_that_lead_to_others_without_end_leave_the_last_minimum(twins, found, monkeypatch):
     chosen_afresh, number = trust_region._chosen_afresh, count(1)
 

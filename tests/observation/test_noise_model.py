@@ -119,7 +119,7 @@ def test_a_mixture_shows_both_of_its_parts(rng):
 
 
 def test_the_model_does_not_jump_when_a_few_residuals_come_or_go(rng):
-    """More cells than are compared: those that are drawn stay drawn. New draws would move it by 2 to 6 %."""
+    """All cells are compared: draws of some would move it by 2 to 6 %."""
     places, normals = sphere(40000)
     values = 0.2 * rng.standard_normal(len(places))
     whole = fit_noise_model([values], [places], [normals])
@@ -127,6 +127,24 @@ def test_the_model_does_not_jump_when_a_few_residuals_come_or_go(rng):
         kept = np.linalg.norm(places - places[hole], axis=1) > 1.2
         without = fit_noise_model([values[kept]], [places[kept]], [normals[kept]])
         assert without.sd == pytest.approx(whole.sd, rel=4e-3)
+
+
+def test_the_model_does_not_hang_on_where_cells_end(rng):
+    """As surfaces move by a hundredth of a millimetre, or all of them by a part of a cell."""
+    values, places, normals = residuals(rng, 0.3, 4.5)
+    noise = fit_noise_model(values, places, normals)
+    shaken = [place + 0.01 * rng.standard_normal(place.shape) for place in places]
+    for other, off in ((shaken, 2e-3), ([place + 0.37 for place in places], 2e-2)):
+        assert fit_noise_model(values, other, normals).correlation_area == pytest.approx(noise.correlation_area, rel=off)
+
+
+def test_far_pairs_of_large_cells_tell_what_those_of_small_cells_do(rng, monkeypatch):
+    values, places, normals = residuals(rng, 0.3, 9.5)
+    noise = fit_noise_model(values, places, normals)
+    monkeypatch.setattr("palpate.observation.noise_model.FAR_CELL", 1.0)
+    every = fit_noise_model(values, places, normals)
+    assert noise.sd == pytest.approx(every.sd, rel=5e-3)
+    assert noise.correlation_area == pytest.approx(every.correlation_area, rel=2e-2)
 
 
 def test_how_far_residuals_are_correlated_does_not_depend_on_their_size(rng):
