@@ -135,7 +135,8 @@ def test_the_model_does_not_hang_on_where_cells_end(rng):
     noise = fit_noise_model(values, places, normals)
     shaken = [place + 0.01 * rng.standard_normal(place.shape) for place in places]
     for other, off in ((shaken, 2e-3), ([place + 0.37 for place in places], 2e-2)):
-        assert fit_noise_model(values, other, normals).correlation_area == pytest.approx(noise.correlation_area, rel=off)
+        found = fit_noise_model(values, other, normals).correlation_area
+        assert found == pytest.approx(noise.correlation_area, rel=off)
 
 
 def test_far_pairs_of_large_cells_tell_what_those_of_small_cells_do(rng, monkeypatch):
