@@ -130,8 +130,8 @@ def test_the_model_does_not_jump_when_a_few_residuals_come_or_go(rng):
 
 
 def test_the_model_does_not_hang_on_where_cells_end(rng):
-    """As surfaces move by a hundredth of a millimetre, or all of them by a part of a cell."""
-    values, places, normals = residuals(rng, 0.3, 4.5)
+    """As surfaces of 5 000 cells move by a hundredth of a millimetre, or all of them by a part of a cell."""
+    values, places, normals = residuals(rng, 0.3, 4.5, radius=40.0, count=2)
     noise = fit_noise_model(values, places, normals)
     shaken = [place + 0.01 * rng.standard_normal(place.shape) for place in places]
     for other, off in ((shaken, 2e-3), ([place + 0.37 for place in places], 2e-2)):

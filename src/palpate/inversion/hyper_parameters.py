@@ -364,8 +364,8 @@ def _most_evident(
         return -value, -2.0 * squares * slopes
 
     limits = np.log(block.amplitudes)
-    start = np.zeros(len(terms)).clip(*limits)
-    bounds = [tuple(limits)] * len(terms)
+    start, bounds = np.zeros(len(terms)).clip(*limits), [tuple(limits)] * len(terms)
+    # to its end: terms that explain the same make a long valley
     best = optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
     squares = np.exp(2.0 * best.x)
     return odds - float(best.fun), sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))

@@ -157,16 +157,16 @@ class _Step:
         return max(gain, self.begin.value - there.value), promised
 
     def remaining(
-        self, unknowns: NDArray[np.float64], there: Evaluation, free: NDArray[np.bool_]
+        self, unknowns: NDArray[np.float64], there: Evaluation, bounds: Bounds, fixed: bool
     ) -> tuple[list[NDArray[np.float64]], bool]:
-        """The steps (n,) by which a minimum may still be missed, of one from unknowns (n,); whether they are across it.
+        """Steps (n,) by which a minimum may be missed after one from unknowns (n,); whether they are across that one.
 
-        Of one that the trust region cut it and what is left at its end, -H^-1 s over the `free` unknowns, or what is
-        left alone across it where J is no lower and the score still leads on by more than half of it: errors of the
-        normals pull a wall along itself, always alike, and no residual changes as they promise.
+        First the step itself; of one that the trust region cut also what is left at its end, -H^-1 s over all that is
+        free. Where J is no lower and the score still leads on by more than half of the step, it is what is left across
+        it: errors of the normals pull a wall along itself, always alike, and no residual changes as they promise.
         """
-        taken, n = self.minimum.unknowns - unknowns, self.objective.n_parameters
-        onward = newton_step(there, free, n)
+        end, n = self.minimum.unknowns, self.objective.n_parameters
+        taken, onward = end - unknowns, newton_step(there, bounds.free(end, there.score, fixed), n)
         along = float(taken @ there.matrix @ onward) / max(float(taken @ there.matrix @ taken), 1e-30)
         if not self.cut and along > 0.5 and self.total(there) >= self.now:
             return [onward - along * taken], True
@@ -365,12 +365,7 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
         """The furthest that one of them (n_unknowns,) moves a log-modulus, over what it may."""
         return max(float(np.max(np.abs(d[:n]) / tolerance, initial=0.0)) for d in steps)
 
-    def remaining() -> tuple[list[NDArray[np.float64]], bool]:
-        """That of the step, by what is known at its end."""
-        seen = minimum.evaluation
-        return step.remaining(before.unknowns, seen, bounds.free(unknowns, seen.score, fixed))
-
-    steps, _ = remaining()
+    steps, _ = step.remaining(before.unknowns, minimum.evaluation, bounds, fixed)
     wanted = size(steps)
     if np.isfinite(rule.coefficients):
         decrement = max(0.5 * float(d @ before.evaluation.matrix @ d) for d in steps)
@@ -389,8 +384,8 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
         pairs = zip(objective.approximations, places, strict=True)
         objective = objective.under([approximation.update(place) for approximation, place in pairs])
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
-        steps, across = remaining()
-        if across and rule.derivatives:  # by a model that is exact there
+        steps, across = step.remaining(before.unknowns, minimum.evaluation, bounds, fixed)
+        if across:  # by a model that is exact there
             wanted, left, missing = size(steps), 0.0, 0.0
     there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals)
     return replace(there, correlated=correlated), spent
