@@ -90,7 +90,7 @@ def prescribed_motion(
         normals = sums[points] / np.maximum(np.linalg.norm(sums[points], axis=1, keepdims=True), np.finfo(float).tiny)
         own = {"kernel_mm": kernel_mm, "prior_mm": prior_mm}
         local = wall_modes(space.points[points], n_modes=n_modes, **own)
-        finer = fine_modes(space.points[points], normals, local) if fine else np.zeros((3 * len(points), 0))
+        finer = fine_modes(space.points[points], normals) if fine else np.zeros((3 * len(points), 0))
         first, n_local = sum(b.shape[1] for b in blocks), local.shape[1]
         if n_local:
             walls.append(

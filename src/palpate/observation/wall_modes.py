@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.mesh.gaussian_process import RANK, RANK_TOLERANCE, kernel_factor
+from palpate.mesh.gaussian_process import RANK_TOLERANCE, karhunen_loeve, kernel_factor
 
 DRIFT_LENGTHS = (1.0, 2.0, 4.0)  # times the modes' own kernel, which they cannot go below
 SWELLING_LENGTHS = (1.0, 2.0)
 FINE_KERNEL_MM, FINE_MM = 8.0, 0.3  # of what a wall does on a finer scale than its modes
-FINE_SHARE, FINE_MODES = 0.95, 150  # of its variance, held by both; number of modes at the most
+FINE_SHARE, FINE_MODES = 0.95, 150  # of its variance; number of modes at the most
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,24 +66,15 @@ def wall_of(
     )
 
 
-def fine_modes(
-    points: NDArray[np.float64], normals: NDArray[np.float64], modes: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Modes (3 n_points, k) mm of what a wall does along its unit normals (n_points, 3) on a finer scale.
+def fine_modes(points: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Modes (3 n_points, k) mm of what a wall does on a finer scale, along its unit normals (n_points, 3).
 
-    Karhunen-Loeve modes of a Gaussian process with a kernel of `FINE_KERNEL_MM` and a standard deviation of `FINE_MM`
-    on points (n_points, 3) mm, less what `modes` (3 n_points, n_modes) do along the normals: what both could do would
-    be the one's or the other's, as good. So many that `FINE_SHARE` of the process's variance is held by both.
+    Karhunen-Loeve modes of a Gaussian process with a kernel of `FINE_KERNEL_MM` and a standard deviation of
+    `FINE_MM` on points (n_points, 3) mm.
     """
-    factor = kernel_factor(points, FINE_KERNEL_MM, min(len(points), RANK), tolerance=0.1 * (1.0 - FINE_SHARE))
-    along = np.einsum("pa,pam->pm", normals, modes.reshape(len(points), 3, -1))
-    basis, scale, _ = np.linalg.svd(along, full_matrices=False)
-    basis = basis[:, scale > np.sqrt(RANK_TOLERANCE) * scale.max(initial=0.0)]
-    left, sizes, _ = np.linalg.svd(factor - basis @ (basis.T @ factor), full_matrices=False)
-    missing = np.sum(sizes**2) - np.cumsum(sizes**2)
-    most = min(FINE_MODES, int(np.count_nonzero(sizes**2 + missing > (1.0 - FINE_SHARE) * len(points))))
-    scalar = left[:, :most] * sizes[:most]
-    return np.asarray(FINE_MM * (normals[:, :, None] * scalar[:, None, :]).reshape(3 * len(points), most))
+    scalar = karhunen_loeve(points, np.ones(len(points)), kernel_mm=FINE_KERNEL_MM, share=FINE_SHARE, most=FINE_MODES)
+    along = normals[:, :, None] * scalar[:, None, :]
+    return np.asarray(FINE_MM * along.reshape(3 * len(points), scalar.shape[1]))
 
 
 def wall_modes(points: NDArray[np.float64], *, n_modes: int, kernel_mm: float, prior_mm: float) -> NDArray[np.float64]:
