@@ -185,12 +185,8 @@ def test_walls_that_are_not_given_keep_the_modes_own_prior():
     assert found.parameters.nuisance_precision == pytest.approx(np.eye(N_MODES))
 
 
-@pytest.mark.parametrize("ln_sd", [np.inf, 0.5])
-def test_what_is_believed_of_the_others_follows_their_prior_mean_too(rng, ln_sd):
-    """The evidence of a block is that of the whole normal model: moduli with a prior of their own are marginalised.
-
-    What is believed of its amplitude counts in it, and in J.
-    """
+def test_what_is_believed_of_the_others_follows_their_prior_mean_too(rng):
+    """The evidence of a block is that of the whole normal model: moduli with a prior of their own are marginalised."""
     n, k = 5, 3
     design = rng.normal(size=(40, n))
     values = rng.normal(size=40) - design @ np.array([0.5, 0.1, 1.5, -2.0, 1.0])
@@ -199,27 +195,21 @@ def test_what_is_believed_of_the_others_follows_their_prior_mean_too(rng, ln_sd)
     parameters = ParameterMap(
         np.ones(2), np.eye(2), ("a", "b"), "c", True, (), prior_mean=mean, prior_precision=precision
     )
-    block = Block("b", "driver", Acts.BOUNDARY, (0,), np.eye(k), ((term,),), amplitudes=(1e-3, 1e3), ln_sds=(ln_sd,))
+    block = Block("b", "driver", Acts.BOUNDARY, (0,), np.eye(k), ((term,),), amplitudes=(1e-3, 1e3))
     parameters = replace(parameters, blocks=(block,), nuisance_precision=np.eye(k))
     prior, data = parameters.prior_matrix, design.T @ design
     x = rng.normal(size=n)
     score = design.T @ (values + design @ x)
     evaluation = SimpleNamespace(matrix=data + prior, prior=prior, score=score, prior_score=np.zeros(n))
     objective = Objective((LaterState(None, ()),), parameters)
-    learned = hyper_parameters.with_amplitudes(objective, evaluation, x)
-    found = learned.parameters.nuisance_precision
-
-    def log_prior(amplitude):
-        return -0.5 * (np.log(amplitude) / ln_sd) ** 2
+    found = hyper_parameters.with_amplitudes(objective, evaluation, x).parameters.nuisance_precision
 
     def log_evidence(amplitude):
-        """ln N(values; -design mean, 1 + design C design^T), all unknowns marginalised, and the amplitude's prior."""
+        """ln N(values; -design mean, 1 + design C design^T), all unknowns marginalised."""
         covariance = linalg.block_diag(np.linalg.inv(precision), amplitude**2 * (term + 1e-3 * np.eye(k)))
         total = np.eye(40) + design @ covariance @ design.T
         away = values + design @ np.append(mean, np.zeros(k))
-        of_data = -0.5 * (away @ np.linalg.solve(total, away) + np.linalg.slogdet(total)[1])
-        return of_data + log_prior(amplitude)
+        return -0.5 * (away @ np.linalg.solve(total, away) + np.linalg.slogdet(total)[1])
 
     amplitude = np.sqrt(1.0 / (found[0, 0] * (1.0 + 1e-3)))
     assert log_evidence(amplitude) > max(log_evidence(0.98 * amplitude), log_evidence(1.02 * amplitude))
-    assert learned.log_priors == pytest.approx((log_prior(amplitude),), abs=1e-6)

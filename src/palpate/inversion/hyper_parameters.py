@@ -200,23 +200,22 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     """
     parameters, n = objective.parameters, objective.n_parameters
     chosen = list(objective.chosen or (None,) * len(parameters.blocks))
-    believed_of = list(objective.log_priors or (0.0,) * len(parameters.blocks))
     data, prior = evaluation.matrix - evaluation.prior, evaluation.prior.copy()
     pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
 
-    def choice(i: int) -> tuple[float, int, _Belief]:
-        """What a block gains by its best alternative, the number of the one it takes, and what is then believed."""
+    def choice(i: int) -> tuple[float, int, NDArray[np.float64]]:
+        """What a block gains by its best alternative, the number of the one it takes, and that one's covariance."""
         block = _admissible(parameters.blocks, i, chosen)
         beliefs = _beliefs(block, parameters.columns(i), data, prior, pull + prior @ parameters.prior_centre)
-        best = max(range(len(beliefs)), key=lambda k: beliefs[k].evidence)
+        best = max(range(len(beliefs)), key=lambda k: beliefs[k][0])
         present = chosen[i] if chosen[i] in range(len(beliefs)) else None
         if present is None and block.acts is Acts.MATERIAL:
             present = 0
         if present is None:
-            return np.inf, best, beliefs[best]
-        gain = beliefs[best].evidence - beliefs[present].evidence
+            return np.inf, best, beliefs[best][1]
+        gain = beliefs[best][0] - beliefs[present][0]
         taken = best if gain > AS_GOOD else present
-        return gain, taken, beliefs[taken]
+        return gain, taken, beliefs[taken][1]
 
     learned = [i for i, block in enumerate(parameters.blocks) if block.alternatives]
     last = [i for i in learned if parameters.blocks[i].last]
@@ -226,11 +225,11 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
             i = max(waiting, key=lambda k: choices[k][0])
             waiting.remove(i)
             _, chosen[i], believed = choices[i]
-            places, believed_of[i] = parameters.columns(i), believed.log_prior
+            places = parameters.columns(i)
             with determined():
-                prior[np.ix_(places, places)] = linalg.inv(believed.covariance)
+                prior[np.ix_(places, places)] = linalg.inv(believed)
     parameters = replace(parameters, nuisance_precision=prior[n:, n:])
-    return replace(objective, parameters=parameters, chosen=tuple(chosen), log_priors=tuple(believed_of))
+    return replace(objective, parameters=parameters, chosen=tuple(chosen))
 
 
 def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
@@ -293,15 +292,15 @@ def undecided_covariance(
             places = parameters.columns(i)
             beliefs = _beliefs(block, places, data, prior, pull + prior @ centre)
             chosen = numbers[i] or 0
-            evidences = np.array([belief.evidence for belief in beliefs])
+            evidences = np.array([evidence for evidence, _ in beliefs])
             shares = np.exp(evidences - evidences.max())
             shares /= shares.sum()
             part = np.zeros((n, n))
-            for k, belief in enumerate(beliefs):
+            for k, (_, believed) in enumerate(beliefs):
                 if k == chosen:
                     continue
                 other = prior.copy()
-                other[np.ix_(places, places)] = linalg.inv(belief.covariance)
+                other[np.ix_(places, places)] = linalg.inv(believed)
                 moved, spread = posterior(other)
                 part += shares[k] * (spread - covariance + np.outer(moved - mean, moved - mean))
             sizes, axes = np.linalg.eigh(part)  # an alternative that knows more makes nothing narrower
@@ -322,8 +321,8 @@ def _beliefs(
     data: NDArray[np.float64],
     prior: NDArray[np.float64],
     pull: NDArray[np.float64],
-) -> list[_Belief]:
-    """Each alternative of a block at its best, all others under their prior.
+) -> list[tuple[float, NDArray[np.float64]]]:
+    """Log-evidence and covariance (n, n) of each alternative of a block at its best, all others under their prior.
 
     data, prior: information and precision (n_unknowns, n_unknowns); pull (n_unknowns,): of data and prior means.
     """
@@ -350,31 +349,23 @@ def _seen(
     return _Seen(0.5 * (information + information.T), pull[places] - followed[:, -1])
 
 
-@dataclass(frozen=True, slots=True)
-class _Belief:
-    """A prior of a block with its largest evidence, ln p(h) of its hyper-parameters in it; their part; C (n, n)."""
-
-    evidence: float
-    log_prior: float
-    covariance: NDArray[np.float64]
-
-
-def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: Block, odds: float) -> _Belief:
-    """The prior with the largest evidence of a family of a block's priors, C = sum_t a_t^2 C_t."""
+def _most_evident(
+    terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: Block, odds: float
+) -> tuple[float, NDArray[np.float64]]:
+    """The largest log-evidence, with its log prior odds, of a family of priors of a block; its covariance (n, n)."""
     floor = 0.0 if block.acts is Acts.MATERIAL else LEAST_VARIANCE  # a field's levels leave no mode without variance
     floored = [term + floor * np.eye(len(term)) for term in terms]
-    evidence, precise = seen.log_evidence(floored), 1.0 / np.array(block.ln_sds or [np.inf] * len(terms))
+    evidence = seen.log_evidence(floored)
 
     def worse(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """Minus the log-evidence and the log prior at ln of the amplitudes (n_terms,), with its derivative."""
-        squares, away = np.exp(2.0 * logs), precise * logs
+        """Minus the log-evidence at ln of the amplitudes (n_terms,), with its derivative."""
+        squares = np.exp(2.0 * logs)
         value, slopes = evidence(squares)
-        return 0.5 * float(away @ away) - value, precise * away - 2.0 * squares * slopes
+        return -value, -2.0 * squares * slopes
 
     limits = np.log(block.amplitudes)
     start, bounds = np.zeros(len(terms)).clip(*limits), [tuple(limits)] * len(terms)
     # to its end: terms that explain the same make a long valley
     best = optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
-    squares, log_prior = np.exp(2.0 * best.x), odds - 0.5 * float(np.sum((precise * best.x) ** 2))
-    covariance = sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))
-    return _Belief(odds - float(best.fun), log_prior, covariance)
+    squares = np.exp(2.0 * best.x)
+    return odds - float(best.fun), sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))

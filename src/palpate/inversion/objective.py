@@ -114,17 +114,15 @@ class Objective:
 
     J(x, h) = sum_k n_k sum_j w_j (rho_k(r_j) / (2 s_k^2) + ln Z_k(s_k)) + 1/2 (x - m)^T P (x - m) - 1/2 ln det P
     - ln p(h) + 1/2 ln det H. The unknowns x, their prior mean m and precision P are those of `parameters`. h: the
-    scales s_k of the observations' `weighting`, the blocks' covariance P^-1 with its amplitudes, and the numbers of the
-    alternatives that are `chosen` for them; log_priors: of each block its part of ln p(h), by odds and by what is
-    believed of amplitudes. The last term integrates over x by Laplace's approximation, H = J^T W J + P. A call gives
-    what depends on x at these h, `total` all of it. Each observation has an offset, where `parameters` have one.
-    learn_last: whether the blocks that are learned last have a choice yet.
+    scales s_k of the observations' `weighting`, the blocks' covariance P^-1, and the numbers of the alternatives
+    that are `chosen` for them, with their odds as p(h); the last term integrates over x by Laplace's approximation, H =
+    J^T W J + P. A call gives what depends on x at these h, `total` all of it. Each observation has an offset, where
+    `parameters` have one. learn_last: whether the blocks that are learned last have a choice yet.
     """
 
     states: tuple[LaterState, ...]
     parameters: ParameterMap
     chosen: tuple[int | None, ...] = ()
-    log_priors: tuple[float, ...] = ()
     learn_last: bool = False
 
     @property
@@ -134,6 +132,8 @@ class Objective:
 
     def total(self, evaluation: Evaluation) -> float:
         """J, dimensionless, where it was evaluated: with ln Z of the residuals, ln det P, ln p(h), ln det H."""
+        pairs = zip(self.parameters.blocks, self.chosen, strict=False)
+        odds = [block.odds[c] for block, c in pairs if block.odds and c is not None]
         residuals = sum(o.weighting.log_normaliser for o in self.observations)
         for state in self.states:
             kinds = {o.kind: o.weighting.sd for o in state.observations if not o.of_driver}
@@ -142,7 +142,7 @@ class Objective:
         normal, beyond = self.as_normal(evaluation)
         n = self.n_parameters
         determinants = log_det(evaluation.matrix - evaluation.prior + normal) - log_det(normal[n:, n:])
-        return evaluation.value + (residuals + beyond - sum(self.log_priors) + 0.5 * determinants)
+        return evaluation.value + (residuals + beyond - sum(odds) + 0.5 * determinants)
 
     def as_normal(self, evaluation: Evaluation) -> tuple[NDArray[np.float64], float]:
         """Precision P (n_unknowns, n_unknowns) for the determinants; what J has beside the normal laws of `parameters`.

@@ -25,7 +25,6 @@ from palpate.observation.wall_modes import Wall
 from palpate.unknowns.total_variation import TotalVariation, total_variation
 
 AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
-FINE_LN_SD = float(np.log(2.0))  # of the amplitude of a wall's finer motion, over what is stated
 STILL, MOVES = 0.02, (1.0, 2.0)  # amplitudes of a frame that stands still, times what is stated; of one that moves
 STILL_RIGID, MOVED_RIGID = 0.005, 0.2
 DRAWN_ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often not
@@ -68,8 +67,7 @@ class Block:
     `informed_problem`); below 0 none is. regions: numbers of the model's regions whose moduli it multiplies, one
     unknown x for all of them, where it acts on moduli: a `share` s of each, in series with the rest of it, is e^x times
     as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is believed where that is not normal;
-    an estimate begins with P then. ln_sds: ln a_t ~ N(0, ln_sd_t^2) of each term, inf where any amplitude is as likely;
-    none: of all terms. Raises `ConfigurationError` for terms of another size.
+    an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
     """
 
     of: str
@@ -90,7 +88,6 @@ class Block:
     share: float = 1.0
     left_out: float = LEFT_OUT
     variation: TotalVariation | None = None
-    ln_sds: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         shape = (len(self.precision),) * 2
@@ -135,15 +132,13 @@ def wall_blocks(wall: Wall, state: int, *, learned: bool = True) -> tuple[Block,
 
     The amplitudes of all are learned together: what one explains the others need not, and in turn whichever was learned
     first would keep it. All lengths are terms of one covariance: as alternatives two may be as good, and which one is
-    taken would hang on the way. What is finer is near what is stated: were it any, short drifts would explain it as
-    well, and the evidence had two maxima.
+    taken would hang on the way.
     """
     n, m = len(wall.columns), wall.n_fine
     terms = [linalg.block_diag(of, np.zeros((m, m))) for of in (*wall.drifts, *wall.swellings)]
-    ln_sds = (np.inf,) * len(terms) + (FINE_LN_SD,) * bool(m)
     terms += [np.diag(np.repeat([0.0, 1.0], [n, m]))] if m else []
-    own = (wall.name, "driver", Acts.BOUNDARY, (state,), np.eye(n + m), (tuple(terms),) if learned else ())
-    return (Block(*own, ln_sds=ln_sds),) if n + m else ()
+    block = Block(wall.name, "driver", Acts.BOUNDARY, (state,), np.eye(n + m), (tuple(terms),) if learned else ())
+    return (block,) if n + m else ()
 
 
 def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
