@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion import InverseProblem, LaterState, begun, invert, with_hyper_parameters
+from palpate.inversion import (
+    InverseProblem,
+    LaterState,
+    Objective,
+    begun,
+    hyper_parameters,
+    invert,
+    with_hyper_parameters,
+)
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.material import material_modes
@@ -21,7 +30,15 @@ from palpate.observation.prescribed_motion import FrameMotion, prescribed_motion
 from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
 from palpate.phantoms.shapes import ball
-from palpate.unknowns import Acts, Block, material_blocks, offset_block, parameter_map, unit_blocks
+from palpate.unknowns import (
+    Acts,
+    Block,
+    ParameterMap,
+    material_blocks,
+    offset_block,
+    parameter_map,
+    unit_blocks,
+)
 from palpate.unknowns.blocks import frame_blocks
 
 DRAWN_MM = 0.3
@@ -65,6 +82,27 @@ def test_the_frame_is_what_the_image_cuts_and_moves_as_its_kernel_says(gelatine,
     assert np.abs(smooth @ smooth.T - expected).mean() < 0.02 * 1.5**2
     blocks = frame_blocks(motion, 0)
     assert [block.size for block in blocks] == [smooth.shape[1], 6]
+
+
+@pytest.mark.parametrize(("moved_mm", "chosen"), [(0.02, 0), (0.25, 1), (1.5, 3)])
+def test_a_frame_is_found_to_stand_still_to_hardly_move_or_to_move(motion, moved_mm, chosen, rng):
+    """By a motion of its own kernel, seen to 0.1 mm at every point."""
+    blocks = frame_blocks(motion, 0)
+    mapping = ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, blocks)
+    seen = motion.modes / 0.1
+    share = moved_mm / 1.5
+    drawn = (
+        share * np.linalg.cholesky(motion.smooth[-1] + 1e-12 * np.eye(blocks[0].size)) @ rng.normal(size=blocks[0].size)
+    )
+    x = np.append(drawn, np.zeros(6))
+    prior = np.eye(len(x))
+    information = seen.T @ seen
+    evaluation = SimpleNamespace(
+        matrix=information + prior, prior=prior, score=-information @ x, prior_score=np.zeros(len(x))
+    )
+    objective = Objective((LaterState(None, ()),), mapping)
+    found = hyper_parameters.with_amplitudes(objective, evaluation, np.zeros(len(x)))
+    assert found.chosen[0] == chosen
 
 
 def test_blocks_stand_in_the_order_in_which_the_model_takes_them(gelatine, motion):
