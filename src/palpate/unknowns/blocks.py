@@ -150,8 +150,7 @@ def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
     tissue. With an amplitude that may be anything between the frame is believed to move less than it does, for patchy
     tissues explain as much, and the moduli pay for it.
     """
-    less = [motion.smooth[0] * STILL**2, motion.smooth[-1] * SLIGHT**2] if motion.smooth else []
-    smooth = [*less, *motion.smooth]
+    smooth = [motion.smooth[0] * STILL**2, motion.smooth[-1] * SLIGHT**2, *motion.smooth] if motion.smooth else []
     rigid = [np.eye(motion.n_rigid) * amount**2 for amount in (STILL_RIGID, SLIGHT_RIGID, MOVED_RIGID)]
     return tuple(
         Block(
