@@ -25,9 +25,8 @@ from palpate.observation.wall_modes import Wall
 from palpate.unknowns.total_variation import TotalVariation, total_variation
 
 AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
-STILL, SLIGHT = 0.02, 0.1  # of a frame that stands still, that hardly moves, times one that moves
-MOVES = (1.0, 2.0)  # amplitudes of a frame, times what is stated
-STILL_RIGID, SLIGHT_RIGID, MOVED_RIGID = 0.005, 0.03, 0.2
+STILL, MOVES = 0.02, (1.0, 2.0)  # amplitudes of a frame that stands still, times what is stated; of one that moves
+STILL_RIGID, MOVED_RIGID = 0.005, 0.2
 DRAWN_ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often not
 KNOWN_MODULUS, FRAME = "known modulus", "frame"
 FIELD, LAYER = "field", "layer"
@@ -145,13 +144,12 @@ def wall_blocks(wall: Wall, state: int, *, learned: bool = True) -> tuple[Block,
 def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
     """The motion in a later state of the frame that the image cuts out of the body: smooth, and rigid.
 
-    Each a mixture, of which the evidence chooses: the frame stands still, hardly moves, or moves as far as is stated.
-    Without the second a cut that moves by a quarter of a millimetre passes for one that stands still in very patchy
-    tissue. With an amplitude that may be anything between the frame is believed to move less than it does, for patchy
-    tissues explain as much, and the moduli pay for it.
+    Each a mixture, of which the evidence chooses: the frame stands still, or it moves as far as is stated. With an
+    amplitude that may be anything between the frame is believed to move less than it does, for patchy tissues explain
+    as much, and the moduli pay for it.
     """
-    smooth = [motion.smooth[0] * STILL**2, motion.smooth[-1] * SLIGHT**2, *motion.smooth] if motion.smooth else []
-    rigid = [np.eye(motion.n_rigid) * amount**2 for amount in (STILL_RIGID, SLIGHT_RIGID, MOVED_RIGID)]
+    smooth = [motion.smooth[0] * STILL**2, *motion.smooth] if motion.smooth else []
+    rigid = [np.eye(motion.n_rigid) * amount**2 for amount in (STILL_RIGID, MOVED_RIGID)]
     return tuple(
         Block(
             "frame",
