@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion import InverseProblem, LaterState, begun, invert, with_hyper_parameters
+from palpate.inversion import (
+    InverseProblem,
+    LaterState,
+    Objective,
+    begun,
+    hyper_parameters,
+    invert,
+    with_hyper_parameters,
+)
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.material import material_modes
@@ -21,7 +30,15 @@ from palpate.observation.prescribed_motion import FrameMotion, prescribed_motion
 from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
 from palpate.phantoms.shapes import ball
-from palpate.unknowns import Acts, Block, material_blocks, offset_block, parameter_map, unit_blocks
+from palpate.unknowns import (
+    Acts,
+    Block,
+    ParameterMap,
+    material_blocks,
+    offset_block,
+    parameter_map,
+    unit_blocks,
+)
 from palpate.unknowns.blocks import frame_blocks
 
 DRAWN_MM = 0.3
@@ -65,6 +82,24 @@ def test_the_frame_is_what_the_image_cuts_and_moves_as_its_kernel_says(gelatine,
     assert np.abs(smooth @ smooth.T - expected).mean() < 0.02 * 1.5**2
     blocks = frame_blocks(motion, 0)
     assert [block.size for block in blocks] == [smooth.shape[1], 6]
+
+
+@pytest.mark.parametrize(("moved_mm", "low", "high"), [(0.02, 0.015, 0.06), (0.25, 0.15, 0.3), (2.0, 1.5, 3.0)])
+def test_a_frame_is_believed_to_stand_still_to_hardly_move_or_to_move(motion, moved_mm, low, high, rng):
+    """By a motion of its own kernel, seen to 0.1 mm at every point: as far as that one, of what is stated 1.5 mm."""
+    blocks = frame_blocks(motion, 0)
+    mapping = ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, blocks)
+    n = blocks[0].size
+    smooth, information = motion.modes[:, :n], motion.modes.T @ motion.modes / 0.1**2
+    x = np.append(moved_mm / 1.5 * rng.normal(size=n), np.zeros(6))
+    prior = np.eye(len(x))
+    evaluation = SimpleNamespace(matrix=information + prior, prior=prior, score=-information @ x, prior_score=0.0 * x)
+    objective = Objective((LaterState(None, ()),), mapping)
+    found = hyper_parameters.with_amplitudes(objective, evaluation, 0.0 * x)
+    believed = np.linalg.inv(found.parameters.nuisance_precision)[:n, :n]
+    moves = smooth.any(axis=1)
+    sd = np.sqrt(np.einsum("pm,mk,pk->p", smooth[moves], believed, smooth[moves]).mean())
+    assert 0.98 * low < sd < 1.02 * high
 
 
 def test_blocks_stand_in_the_order_in_which_the_model_takes_them(gelatine, motion):

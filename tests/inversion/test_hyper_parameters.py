@@ -178,7 +178,7 @@ def test_a_field_varies_by_what_is_stated(minimum, twins):
     assert there.parameters.nuisance_precision == pytest.approx(one.parameters.blocks[0].precision)
 
 
-def two_causes(objective, found, *, levels, odds, rivals=()):
+def two_causes(objective, found, *, levels, odds, rivals=(), last=(True, True)):
     """Two blocks of the driver's modes, and an evaluation that sees 2 of the sum of their first ones and a modulus."""
     n, m = objective.n_parameters, objective.parameters.n_coefficients
     unknowns = np.zeros(n + m)
@@ -193,10 +193,12 @@ def two_causes(objective, found, *, levels, odds, rivals=()):
             tuple((level**2 * np.eye(size),) for level in own),
             (1.0, 1.0),
             odds=odd,
-            last=True,
+            last=waits,
             rivals=against,
         )
-        for cause, size, own, odd, against in zip("ab", (1, m - 1), levels, odds, ((), rivals), strict=True)
+        for cause, size, own, odd, against, waits in zip(
+            "ab", (1, m - 1), levels, odds, ((), rivals), last, strict=True
+        )
     )
     parameters = replace(objective.parameters, blocks=blocks, nuisance_precision=np.eye(m) / levels[0][0] ** 2)
     prior = parameters.prior_matrix
@@ -213,6 +215,22 @@ def test_of_two_causes_of_one_sight_the_likelier_is_taken_in_whichever_order_the
     objective, evaluation, unknowns = two_causes(*minimum, levels=[(0.1, 1.0)] * 2, odds=odds)
     chosen = with_amplitudes(replace(objective, chosen=(0, 0)), evaluation, unknowns).chosen
     assert chosen == tuple(int(k == likelier) for k in (0, 1))
+
+
+@pytest.mark.parametrize(("odd", "expected"), [(0.0, 0), (3.0, 1)])
+def test_what_a_rival_explains_as_well_is_the_rivals_where_none_has_a_choice_yet(minimum, odd, expected):
+    """A block leaves its first alternative for the next where it explains more; it would else, choosing first."""
+    odds, levels = [(0.0, odd, -9.0), (0.0, 0.0, 0.0)], [(0.1, 1.0, 2.0), (0.1, 1.0, 2.0)]
+    for rivals, found in (((), 1), (("a",), expected)):
+        posed = two_causes(*minimum, levels=levels, odds=odds, rivals=rivals, last=(False, True))
+        assert with_amplitudes(*posed).chosen[0] == found
+
+
+def test_what_no_rival_is_taken_for_is_the_blocks_own(minimum):
+    """An alternative further than the next to the first one is judged by itself."""
+    levels = [(0.1, 0.2, 2.0), (0.1, 1.0, 2.0)]
+    posed = two_causes(*minimum, levels=levels, odds=[(0.0,) * 3] * 2, rivals=("a",), last=(False, True))
+    assert with_amplitudes(*posed).chosen == (2, 0)
 
 
 def test_the_last_alternative_is_none_where_a_rival_has_left_its_first(minimum):

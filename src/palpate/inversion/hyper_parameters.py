@@ -25,6 +25,7 @@ from palpate.inversion.objective import (
 from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns.blocks import Acts, Block
+from palpate.unknowns.parameters import ParameterMap
 
 LEAST_VARIANCE = 1e-3  # of a coefficient of a motion, in its unit: no mode is forbidden
 FITTED = 0.5  # of a kind's residuals, the largest share that is taken for fitted by the unknowns
@@ -196,21 +197,22 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     ln det(A + P) + ln det P) up to a constant (MacKay 1992, Neural Computation 4, 415-447, section 4), the other blocks
     under their present prior. An alternative stays until another one is more than as good; of a material the first one.
     Of blocks that are learned last the one that gains most has its choice first: the first of them would else take what
-    another one explains better.
+    another one explains better. Where these have their choice, too, the alternative next to the first one, of three, is
+    judged against that by what rivals gain beside each, for what either explains as well would else be this block's.
     """
     parameters, n = objective.parameters, objective.n_parameters
     chosen = list(objective.chosen or (None,) * len(parameters.blocks))
-    data, prior = evaluation.matrix - evaluation.prior, evaluation.prior.copy()
-    pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
+    model, prior = _normal_model(parameters, evaluation, unknowns), evaluation.prior.copy()
 
     def choice(i: int) -> tuple[float, int, NDArray[np.float64]]:
         """What a block gains by its best alternative, the number of the one it takes, and that one's covariance."""
-        block = _admissible(parameters.blocks, i, chosen)
-        beliefs = _beliefs(block, parameters.columns(i), data, prior, pull + prior @ parameters.prior_centre)
+        block, beliefs = parameters.blocks[i], model.beliefs(i, chosen, prior)
         best = max(range(len(beliefs)), key=lambda k: beliefs[k][0])
         present = chosen[i] if chosen[i] in range(len(beliefs)) else None
         if present is None and block.acts is Acts.MATERIAL:
             present = 0
+        if present is None and objective.learn_last and best == 1 < len(beliefs) - 1:
+            beliefs, present = model.beliefs_beside(i, chosen, prior)[:2], 0
         if present is None:
             return np.inf, best, beliefs[best][1]
         gain = beliefs[best][0] - beliefs[present][0]
@@ -225,9 +227,7 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
             i = max(waiting, key=lambda k: choices[k][0])
             waiting.remove(i)
             _, chosen[i], believed = choices[i]
-            places = parameters.columns(i)
-            with determined():
-                prior[np.ix_(places, places)] = linalg.inv(believed)
+            prior = model.believed(i, believed, prior)
     parameters = replace(parameters, nuisance_precision=prior[n:, n:])
     return replace(objective, parameters=parameters, chosen=tuple(chosen))
 
@@ -270,15 +270,13 @@ def undecided_covariance(
     of the log-moduli under each, and how far d_k it moves them, with the residuals linear around unknowns (n_unknowns,)
     (law of total variance).
     """
-    parameters, n = objective.parameters, objective.n_parameters
-    data, prior = evaluation.matrix - evaluation.prior, evaluation.prior
-    centre = parameters.prior_centre
-    pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
+    parameters, n, prior = objective.parameters, objective.n_parameters, evaluation.prior
+    model = _normal_model(parameters, evaluation, unknowns)
 
     def posterior(of: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Mean (n,) and covariance (n, n) of the log-moduli under a prior's precision."""
-        right = np.column_stack([np.eye(len(of))[:, :n], pull + of @ centre])
-        solved = linalg.solve(data + of, right, assume_a="pos", check_finite=False)
+        right = np.column_stack([np.eye(len(of))[:, :n], model.pull + of @ parameters.prior_centre])
+        solved = linalg.solve(model.data + of, right, assume_a="pos", check_finite=False)
         return solved[:n, n], solved[:n, :n]
 
     found = dict[str, NDArray[np.float64]]()
@@ -286,12 +284,10 @@ def undecided_covariance(
     with determined():
         mean, covariance = posterior(prior)
         for i in range(len(parameters.blocks)):
-            block = _admissible(parameters.blocks, i, numbers)
+            block, chosen = parameters.blocks[i], numbers[i] or 0
             if not block.odds:
                 continue
-            places = parameters.columns(i)
-            beliefs = _beliefs(block, places, data, prior, pull + prior @ centre)
-            chosen = numbers[i] or 0
+            beliefs = model.beliefs(i, numbers, prior)
             evidences = np.array([evidence for evidence, _ in beliefs])
             shares = np.exp(evidences - evidences.max())
             shares /= shares.sum()
@@ -299,9 +295,7 @@ def undecided_covariance(
             for k, (_, believed) in enumerate(beliefs):
                 if k == chosen:
                     continue
-                other = prior.copy()
-                other[np.ix_(places, places)] = linalg.inv(believed)
-                moved, spread = posterior(other)
+                moved, spread = posterior(model.believed(i, believed, prior))
                 part += shares[k] * (spread - covariance + np.outer(moved - mean, moved - mean))
             sizes, axes = np.linalg.eigh(part)  # an alternative that knows more makes nothing narrower
             found[block.cause] = found.get(block.cause, np.zeros((n, n))) + (axes * np.maximum(sizes, 0.0)) @ axes.T
@@ -315,20 +309,54 @@ def _admissible(blocks: Sequence[Block], number: int, chosen: Sequence[int | Non
     return replace(block, alternatives=block.alternatives[:-1], odds=block.odds[:-1]) if rivals else block
 
 
-def _beliefs(
-    block: Block,
-    places: NDArray[np.int64],
-    data: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    pull: NDArray[np.float64],
-) -> list[tuple[float, NDArray[np.float64]]]:
-    """Log-evidence and covariance (n, n) of each alternative of a block at its best, all others under their prior.
+def _normal_model(parameters: ParameterMap, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> _NormalModel:
+    """That of residuals which are linear around unknowns (n,), where they were evaluated."""
+    data = evaluation.matrix - evaluation.prior
+    return _NormalModel(parameters, data, data @ unknowns - (evaluation.score - evaluation.prior_score))
 
-    data, prior: information and precision (n_unknowns, n_unknowns); pull (n_unknowns,): of data and prior means.
-    """
-    with determined():
-        seen, odds = _seen(data + prior, data, pull, places).whitened(), block.odds or (0.0,) * len(block.alternatives)
-        return [_most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)]
+
+@dataclass(frozen=True, slots=True)
+class _NormalModel:
+    """Linear residuals: the information A = J^T W J of all unknowns, `data` (n, n), and the pull A x - J^T W r (n,)."""
+
+    parameters: ParameterMap
+    data: NDArray[np.float64]
+    pull: NDArray[np.float64]
+
+    def beliefs(
+        self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]
+    ) -> list[tuple[float, NDArray[np.float64]]]:
+        """Log-evidence and covariance (m, m) of each alternative of block i at its best, others under a prior (n, n).
+
+        Of the alternatives that those `chosen` for the others leave it.
+        """
+        block, places = _admissible(self.parameters.blocks, i, chosen), self.parameters.columns(i)
+        pull, odds = self.pull + prior @ self.parameters.prior_centre, block.odds or (0.0,) * len(block.alternatives)
+        with determined():
+            seen = _seen(self.data + prior, self.data, pull, places).whitened()
+            return [_most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)]
+
+    def beliefs_beside(
+        self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]
+    ) -> list[tuple[float, NDArray[np.float64]]]:
+        """The same, each with what its rivals gain beside it by more than what is as good, over their first ones."""
+        found, cause = list[tuple[float, NDArray[np.float64]]](), self.parameters.blocks[i].cause
+        rivals = [j for j, block in enumerate(self.parameters.blocks) if cause in block.rivals]
+        for j in rivals:
+            prior = self.believed(j, self.parameters.blocks[j].alternatives[0][0], prior)
+        for k, (evidence, covariance) in enumerate(self.beliefs(i, chosen, prior)):
+            beside, among = self.believed(i, covariance, prior), [k if j == i else of for j, of in enumerate(chosen)]
+            evidences = [[of for of, _ in self.beliefs(j, among, beside)] for j in rivals]
+            gains = [max(of) - of[0] for of in evidences]
+            found.append((evidence + sum(gain for gain in gains if gain > AS_GOOD), covariance))
+        return found
+
+    def believed(self, i: int, covariance: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A prior (n, n) with another covariance (m, m) of block i."""
+        places, found = self.parameters.columns(i), prior.copy()
+        with determined():
+            found[np.ix_(places, places)] = linalg.inv(covariance)
+        return found
 
 
 def _seen(

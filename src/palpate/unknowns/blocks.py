@@ -25,7 +25,8 @@ from palpate.observation.wall_modes import Wall
 from palpate.unknowns.total_variation import TotalVariation, total_variation
 
 AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
-STILL, MOVES = 0.02, (1.0, 2.0)  # amplitudes of a frame that stands still, times what is stated; of one that moves
+STILL, SLIGHT = 0.02, 0.1  # of a frame that stands still, that hardly moves, times one that moves
+MOVES = (1.0, 2.0)  # amplitudes of a frame, times what is stated
 STILL_RIGID, MOVED_RIGID = 0.005, 0.2
 DRAWN_ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often not
 KNOWN_MODULUS, FRAME = "known modulus", "frame"
@@ -60,14 +61,14 @@ class Block:
     alternatives, of which the likeliest is taken; none: of alternatives that are alike the widest. considered: the
     images cannot tell them, so that they are held at 0, and what they may be counts in the covariance (Schmidt 1966).
     last: its prior is learned where the estimate has converged under those of the others; before it would take what
-    they explain, or leave it to them. rivals: causes that explain as much as its last alternative, which is none where
-    a block of theirs has left its first one. released: held at 0 as well while an estimate is sought, and free under P
-    where its interval is, and in the estimate where that is likelier, by log prior odds of `released_odds`. left_out:
-    variances of the first noise, a tenth of the found one, that what is left out of the unknowns may explain (see
-    `informed_problem`); below 0 none is. regions: numbers of the model's regions whose moduli it multiplies, one
-    unknown x for all of them, where it acts on moduli: a `share` s of each, in series with the rest of it, is e^x times
-    as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is believed where that is not normal;
-    an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
+    they explain, or leave it to them. rivals: causes that explain as much as it, beside which they are chosen: its last
+    alternative is none where a block of theirs has left its first one. released: held at 0 as well while an estimate is
+    sought, and free under P where its interval is, and in the estimate where that is likelier, by log prior odds of
+    `released_odds`. left_out: variances of the first noise, a tenth of the found one, that what is left out of the
+    unknowns may explain (see `informed_problem`); below 0 none is. regions: numbers of the model's regions whose moduli
+    it multiplies, one unknown x for all of them, where it acts on moduli: a `share` s of each, in series with the rest
+    of it, is e^x times as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is believed where
+    that is not normal; an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
     """
 
     of: str
@@ -144,11 +145,12 @@ def wall_blocks(wall: Wall, state: int, *, learned: bool = True) -> tuple[Block,
 def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
     """The motion in a later state of the frame that the image cuts out of the body: smooth, and rigid.
 
-    Each a mixture, of which the evidence chooses: the frame stands still, or it moves as far as is stated. With an
-    amplitude that may be anything between the frame is believed to move less than it does, for patchy tissues explain
-    as much, and the moduli pay for it.
+    Each a mixture, of which the evidence chooses: the frame stands still, or moves as far as is stated; or, smoothly,
+    it hardly moves, for a cut that moves by a quarter of a millimetre passes else for one that stands still in very
+    patchy tissue. With an amplitude that may be anything between the frame is believed to move less than it does, for
+    patchy tissues explain as much, and the moduli pay for it.
     """
-    smooth = [motion.smooth[0] * STILL**2, *motion.smooth] if motion.smooth else []
+    smooth = [motion.smooth[0] * STILL**2, motion.smooth[-1] * SLIGHT**2, *motion.smooth] if motion.smooth else []
     rigid = [np.eye(motion.n_rigid) * amount**2 for amount in (STILL_RIGID, MOVED_RIGID)]
     return tuple(
         Block(
