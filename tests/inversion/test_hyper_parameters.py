@@ -178,7 +178,7 @@ def test_a_field_varies_by_what_is_stated(minimum, twins):
     assert there.parameters.nuisance_precision == pytest.approx(one.parameters.blocks[0].precision)
 
 
-def two_causes(objective, found, *, levels, odds, rivals=(), last=(True, True)):
+def two_causes(objective, found, *, levels, odds, rivals=(), last=(True, True), slight=False):
     """Two blocks of the driver's modes, and an evaluation that sees 2 of the sum of their first ones and a modulus."""
     n, m = objective.n_parameters, objective.parameters.n_coefficients
     unknowns = np.zeros(n + m)
@@ -195,6 +195,7 @@ def two_causes(objective, found, *, levels, odds, rivals=(), last=(True, True)):
             odds=odd,
             last=waits,
             rivals=against,
+            slight=slight and cause == "a",
         )
         for cause, size, own, odd, against, waits in zip(
             "ab", (1, m - 1), levels, odds, ((), rivals), last, strict=True
@@ -222,14 +223,15 @@ def test_what_a_rival_explains_as_well_is_the_rivals_where_none_has_a_choice_yet
     """A block leaves its first alternative for the next where it explains more; it would else, choosing first."""
     odds, levels = [(0.0, odd, -9.0), (0.0, 0.0, 0.0)], [(0.1, 1.0, 2.0), (0.1, 1.0, 2.0)]
     for rivals, found in (((), 1), (("a",), expected)):
-        posed = two_causes(*minimum, levels=levels, odds=odds, rivals=rivals, last=(False, True))
+        posed = two_causes(*minimum, levels=levels, odds=odds, rivals=rivals, last=(False, True), slight=True)
         assert with_amplitudes(*posed).chosen[0] == found
 
 
 def test_what_no_rival_is_taken_for_is_the_blocks_own(minimum):
-    """An alternative further than the next to the first one is judged by itself."""
+    """An alternative further than the slight one is judged by itself."""
     levels = [(0.1, 0.2, 2.0), (0.1, 1.0, 2.0)]
-    posed = two_causes(*minimum, levels=levels, odds=[(0.0,) * 3] * 2, rivals=("a",), last=(False, True))
+    odds = [(0.0,) * 3] * 2
+    posed = two_causes(*minimum, levels=levels, odds=odds, rivals=("a",), last=(False, True), slight=True)
     assert with_amplitudes(*posed).chosen == (2, 0)
 
 

@@ -197,8 +197,8 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     ln det(A + P) + ln det P) up to a constant (MacKay 1992, Neural Computation 4, 415-447, section 4), the other blocks
     under their present prior. An alternative stays until another one is more than as good; of a material the first one.
     Of blocks that are learned last the one that gains most has its choice first: the first of them would else take what
-    another one explains better. Where these have their choice, too, the alternative next to the first one, of three, is
-    judged against that by what rivals gain beside each, for what either explains as well would else be this block's.
+    another one explains better. Where these have their choice, too, a slight second alternative of a block is judged
+    against its first by what rivals gain beside each, for what either explains as well would else be this block's.
     """
     parameters, n = objective.parameters, objective.n_parameters
     chosen = list(objective.chosen or (None,) * len(parameters.blocks))
@@ -211,7 +211,7 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
         present = chosen[i] if chosen[i] in range(len(beliefs)) else None
         if present is None and block.acts is Acts.MATERIAL:
             present = 0
-        if present is None and objective.learn_last and best == 1 < len(beliefs) - 1:
+        if present is None and objective.learn_last and block.slight and best == 1:
             beliefs, present = model.beliefs_beside(i, chosen, prior)[:2], 0
         if present is None:
             return np.inf, best, beliefs[best][1]
@@ -244,14 +244,13 @@ def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[n
     if not numbers:
         return objective
     prior, centre = parameters.prior_matrix, parameters.prior_centre
-    data = evaluation.matrix - evaluation.prior
-    pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
+    model = _normal_model(parameters, evaluation, unknowns)
     for i in numbers:
         places, variation = parameters.columns(i), parameters.blocks[i].variation
         assert variation is not None
         centre[places] = 0.0
         with determined():
-            seen = _seen(data + prior, data, pull + prior @ centre, places)
+            seen = _seen(model.data + prior, model.data, model.pull + prior @ centre, places)
             x = variation.least(seen.information, seen.pull, unknowns[places])
             prior[np.ix_(places, places)] = curvature = variation.curvature(x)
             away = linalg.solve(curvature, variation.gradient(x), assume_a="pos")

@@ -61,14 +61,15 @@ class Block:
     alternatives, of which the likeliest is taken; none: of alternatives that are alike the widest. considered: the
     images cannot tell them, so that they are held at 0, and what they may be counts in the covariance (Schmidt 1966).
     last: its prior is learned where the estimate has converged under those of the others; before it would take what
-    they explain, or leave it to them. rivals: causes that explain as much as it, beside which they are chosen: its last
-    alternative is none where a block of theirs has left its first one. released: held at 0 as well while an estimate is
-    sought, and free under P where its interval is, and in the estimate where that is likelier, by log prior odds of
-    `released_odds`. left_out: variances of the first noise, a tenth of the found one, that what is left out of the
-    unknowns may explain (see `informed_problem`); below 0 none is. regions: numbers of the model's regions whose moduli
-    it multiplies, one unknown x for all of them, where it acts on moduli: a `share` s of each, in series with the rest
-    of it, is e^x times as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is believed where
-    that is not normal; an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
+    they explain, or leave it to them. rivals: causes that explain as much as it: its last alternative is none where a
+    block of theirs has left its first one. slight: whether its second alternative is so near the first that blocks with
+    its cause among their rivals explain as much. released: held at 0 as well while an estimate is sought, and free
+    under P where its interval is, and in the estimate where that is likelier, by log prior odds of `released_odds`.
+    left_out: variances of the first noise, a tenth of the found one, that what is left out of the unknowns may explain
+    (see `informed_problem`); below 0 none is. regions: numbers of the model's regions whose moduli it multiplies, one
+    unknown x for all of them, where it acts on moduli: a `share` s of each, in series with the rest of it, is e^x times
+    as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is believed where that is not normal;
+    an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
     """
 
     of: str
@@ -82,6 +83,7 @@ class Block:
     considered: bool = False
     last: bool = False
     rivals: tuple[str, ...] = ()
+    slight: bool = False
     released: bool = False
     released_odds: float = 0.0
     unit_mm: float = 1.0
@@ -162,6 +164,7 @@ def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
             tuple((term,) for term in terms),
             amplitudes=amplitudes,
             odds=(0.0, *(-float(np.log(len(terms) - 1)),) * (len(terms) - 1)),
+            slight=terms is smooth,
             unit_mm=motion.smooth_mm,
         )
         for terms, amplitudes in ((smooth, MOVES), (rigid, (1.0, 1.0)))
