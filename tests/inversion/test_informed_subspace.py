@@ -50,7 +50,8 @@ def test_what_is_left_out_could_explain_less_than_it_may(rng):
     """The posterior's covariance of what is kept is that of all unknowns, but for the share that is stated."""
     n = 40
     covariance, information = spread(rng, n), 40.0 * spread(rng, n)
-    block = Block("a", "b", Acts.BOUNDARY, (0,), np.linalg.inv(covariance))
+    alternatives, most = ((covariance,),), (0.1, 1.0)
+    block = Block("a", "b", Acts.BOUNDARY, (0,), np.linalg.inv(covariance), alternatives, amplitudes=most)
     basis, inverse = informed.informed_combinations(block, information)
     assert basis.shape[1] < n
     assert inverse @ basis == pytest.approx(np.eye(basis.shape[1]), abs=1e-9)
@@ -63,14 +64,22 @@ def test_what_is_left_out_could_explain_less_than_it_may(rng):
     assert np.linalg.eigvalsh(narrow + rest - whole).min() > -1e-9  # what is left at its prior is no narrower
 
 
-def test_a_block_of_few_unknowns_offsets_and_poissons_ratios_stay_as_they_are():
-    few = Block("a", "b", Acts.BOUNDARY, (0,), np.eye(informed.SMALL))
-    drawn = Block("a", "b", Acts.RESIDUALS, (0,), np.eye(informed.SMALL + 1))
-    ratios = Block("all", "poisson", Acts.MATERIAL, (0,), np.eye(informed.SMALL + 1))
-    for block in (few, drawn, ratios):
-        basis, inverse = informed.informed_combinations(block, np.zeros((block.size, block.size)))
-        assert np.array_equal(basis, np.eye(block.size))
-        assert np.array_equal(inverse, np.eye(block.size))
+def test_offsets_and_what_is_not_learned_stay_as_they_are():
+    own = ((np.eye(13),),)
+    for acts, alternatives in ((Acts.RESIDUALS, own), (Acts.MODULI, ()), (Acts.MATERIAL, ()), (Acts.BOUNDARY, ())):
+        block = Block("a", "b", acts, (0,), np.eye(13), alternatives)
+        basis, inverse = informed.informed_combinations(block, np.zeros((13, 13)))
+        assert np.array_equal(basis, np.eye(13))
+        assert np.array_equal(inverse, np.eye(13))
+
+
+@pytest.mark.parametrize("n", [1, 3, 20])
+def test_of_a_motion_that_nothing_sees_one_combination_is_kept(rng, n):
+    covariance = spread(rng, n)
+    block = Block("a", "b", Acts.BOUNDARY, (0,), np.linalg.inv(covariance), ((covariance,),))
+    basis, inverse = informed.informed_combinations(block, np.zeros((n, n)))
+    assert basis.shape == (n, 1)
+    assert inverse @ basis == pytest.approx(np.eye(1))
 
 
 def test_what_is_undecided_is_the_second_moment_of_the_mixture(twins, twin, voxels):

@@ -112,11 +112,13 @@ def concluded(
 def compared(distinct: Sequence[OuterIterate], bounds: Bounds) -> tuple[list[float], int]:
     """The objective at each iterate, hyper-parameters at their best, and what it cost in evaluations.
 
-    All with the numbers of independent residuals of the first that converged, which are data of an objective.
+    All with the numbers of independent residuals of the one that has the fewest of those that converged: these are data
+    of an objective, and by too many of them what explains smooth noise seems clearly likelier.
     """
     if len(distinct) == 1:
         return [distinct[0].objective.total(distinct[0].minimum.evaluation)], 0
-    reference = next((iterate for iterate in distinct if iterate.minimum.converged), distinct[0]).objective
+    ended = [iterate.objective for iterate in distinct if iterate.minimum.converged] or [distinct[0].objective]
+    reference = min(ended, key=lambda objective: objective.n_independent)
     values, evaluations = [], 0
     for iterate in distinct:
         begin = begun(iterate.objective.counted_as(reference), iterate.minimum.unknowns)

@@ -25,7 +25,15 @@ from palpate.inversion.optimise import (
     gauss_newton,
     same_minimum,
 )
-from palpate.inversion.trust_region import NEAR, OuterIterate, StopRule, begun, minimised, total_counted_as
+from palpate.inversion.trust_region import (
+    NEAR,
+    OuterIterate,
+    StopRule,
+    begun,
+    minimised,
+    total_counted_as,
+    totals_counted_alike,
+)
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
 from palpate.parallel import blas_on_one_thread
@@ -226,7 +234,8 @@ def _linear(
         belongs[groups[number]], spent = len(ends), spent + end.minimum.evaluations
         ends.append(end)
     same = grouped([end.minimum for end in ends], n)
-    totals = [e.objective.total(e.minimum.evaluation) if e.minimum.converged else np.inf for e in ends]
+    pairs = zip(ends, totals_counted_alike(ends), strict=True)
+    totals = [total if end.minimum.converged else np.inf for end, total in pairs]
     best = [min(members(same, g), key=lambda i: totals[i]) for g in range(max(same) + 1)]
     order = sorted(best, key=lambda i: totals[i])
     followed = list[OuterIterate]()

@@ -25,8 +25,6 @@ from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.progress import Progress
 from palpate.unknowns.blocks import Acts, Block
 
-SMALL = 12  # unknowns of a block, which are kept
-
 
 @dataclass(frozen=True, slots=True)
 class InformedProblem:
@@ -130,14 +128,17 @@ class _Responses:
 def informed_combinations(
     block: Block, information: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Combinations (n, k) of a block's unknowns that data of an information (n, n) see, and their inverse (k, n)."""
-    ratios = block.acts is Acts.MATERIAL and not block.alternatives  # Poisson's, one of each tissue, are no field
-    edges = block.variation is not None  # which are made of what data see and what they do not see alone
-    if block.size <= SMALL or block.acts is Acts.RESIDUALS or ratios or edges:
+    """Combinations (n, k) of a block's unknowns that data of an information (n, n) see, and their inverse (k, n).
+
+    Of a motion or a field whose prior is learned, at least the one that is seen most. Other unknowns stay as they are:
+    Poisson's ratios have a tissue each, edges are made of what data see and what they do not see alone.
+    """
+    if not block.alternatives or block.acts is Acts.RESIDUALS:
         return np.eye(block.size), np.eye(block.size)
     root = linalg.cholesky(block.widest, lower=True)
     sizes, vectors = linalg.eigh(root.T @ information @ root)
     left = np.cumsum(np.maximum(sizes, 0.0)) < block.left_out
+    left[-1:] = False
     kept = vectors[:, ~left][:, ::-1]
     unit = float(np.sqrt(np.mean(np.diag(block.widest))))  # coefficients keep their size
     basis = root @ kept / unit

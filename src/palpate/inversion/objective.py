@@ -213,6 +213,11 @@ class Objective:
         states = [state.with_observations([next(left) for _ in state.observations]) for state in self.states]
         return replace(self, states=tuple(states))
 
+    @property
+    def n_independent(self) -> float:
+        """Number of independent residuals of all observations."""
+        return sum(o.weighting.count for o in self.observations)
+
     def counted_as(self, other: Objective) -> Objective:
         """The same with the numbers of independent residuals of another one, under which both may be compared."""
         pairs = zip(self.observations, other.observations, strict=True)

@@ -36,7 +36,6 @@ NOISE = 0.5  # of the objective: that of closest points that slide over voxels (
 INNER = 1e-4  # of the objective: decrement of a minimum on linear residuals, and change by hyper-parameters, that end
 SETTLES = 6  # times that numbers of independent residuals are taken anew, after which they stay
 TRIED = 4  # iterations under alternatives that were chosen afresh, after which J must be less than before
-LEAST_SD = 0.03  # of ln E, see `linearisation_error`
 
 
 class Criterion(StrEnum):
@@ -279,11 +278,8 @@ def _chosen_afresh(now: OuterIterate) -> OuterIterate:
 
 
 def _likeliest(ends: Sequence[OuterIterate], last: OuterIterate) -> OuterIterate:
-    """Of minima under other alternatives that with the least J, by the numbers of independent residuals of the last.
-
-    The cost is that of all, up to the `last` iteration.
-    """
-    best = ends[0] if len(ends) == 1 else min(ends, key=lambda end: total_counted_as(end, ends[-1]))
+    """Of minima under other alternatives that with the least J; the cost is that of all, up to the `last` iteration."""
+    best = ends[int(np.argmin(totals_counted_alike(ends)))]
     if best.minimum.evaluations == last.minimum.evaluations:
         return best
     spent = last.counts - replace(best, checks=SolveCounts()).counts
@@ -296,6 +292,12 @@ def total_counted_as(iterate: OuterIterate, other: OuterIterate) -> float:
     return objective.total(LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns))
 
 
+def totals_counted_alike(iterates: Sequence[OuterIterate]) -> list[float]:
+    """J where each iteration ended, all with the numbers of independent residuals of the one that has the fewest."""
+    fewest = min(iterates, key=lambda iterate: iterate.objective.n_independent)
+    return [total_counted_as(iterate, fewest) for iterate in iterates]
+
+
 def _numbers(objective: Objective) -> tuple[int | None, ...]:
     """Those of the alternatives chosen for the blocks, None where a block has none, or no choice yet."""
     return objective.chosen or (None,) * len(objective.parameters.blocks)
@@ -305,9 +307,10 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     """Unknowns and hyper-parameters with the least objective on residuals linear around a minimum so far.
 
     In turn, each of which lowers it: unknowns under given hyper-parameters, and these (see `with_hyper_parameters`).
-    Where the step is damped hyper-parameters stay. So do the numbers of independent residuals where the trust region,
-    and no bound, ends the step, or it is longer than a standard deviation of some log-modulus, for what is still motion
-    is alike over whole surfaces; and once they have been taken anew some times.
+    Where the step is damped hyper-parameters stay. The numbers of independent residuals are taken anew before blocks
+    have their first choice, for those of voxels' rounding are many more than those of smooth noise, of which a frame or
+    a wall that moves explains much then; and from then on some times, where neither the trust region ends the step nor
+    it is longer than a standard deviation of some log-modulus, for what is still motion is alike over whole surfaces.
     """
     objective, at, n = start.objective, start.minimum, start.objective.n_parameters
     trusted = [state.approximation.trust_radius for state in objective.states if state.approximation]
@@ -334,7 +337,8 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     if damping or not rule.learn:
         return _Step(objective, found, at.evaluation, now, total, cut, settled=False)
     settled = not cut and bool(np.all(np.abs(found.unknowns - at.unknowns)[:n] < posterior_sd(found, n)))
-    if rule.correlate and settled and start.correlated < SETTLES:
+    choosing = not objective.chosen and any(b.odds and not b.last for b in objective.parameters.blocks)
+    if rule.correlate and (settled or choosing) and start.correlated < SETTLES:
         objective = with_correlations(objective, found.evaluation)
         found = replace(found, evaluation=LinearisedObjective(objective, at.unknowns, at.evaluation)(found.unknowns))
         plain = LinearisedObjective(objective, found.unknowns, found.evaluation)
@@ -374,7 +378,7 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
     if np.isinf(rule.model_error):
         there = OuterIterate(objective, minimum, Convergence(wanted, 0.0, 0.0), now.checks, now.totals)
         return replace(there, correlated=correlated), spent
-    left = float(np.max(linearisation_error(objective, minimum) / tolerance, initial=0.0)) if rule.derivatives else 0.0
+    left = linearisation_distance(objective, minimum.unknowns) / rule.step_sd if rule.derivatives else 0.0
     checks, missing = now.checks, np.inf
     if left < 1.0:  # else it is made exact in any case
         _, off, cost = model_error(objective, minimum)
@@ -391,18 +395,17 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
     return replace(there, correlated=correlated), spent
 
 
-def linearisation_error(objective: Objective, there: Minimum) -> NDArray[np.float64]:
-    """How far (n_parameters,), of ln E, derivatives that are exact elsewhere may set an estimate off.
+def linearisation_distance(objective: Objective, unknowns: NDArray[np.float64]) -> float:
+    """The largest distance d of ln E at unknowns (n_unknowns,) from where an approximation's derivatives are exact.
 
-    At a distance d of ln E they are off by a share d, and so is what the residuals pull with them, which is worth a
-    posterior standard deviation: d sd, d the largest of all log-moduli; infinite where they are exact nowhere yet. A
-    standard deviation counts as 0.03 at least: its own error is a share d, too, and may be a per cent.
+    There they are off by a share d, and so is what the residuals pull with them, which is worth a posterior standard
+    deviation: an estimate is set off by d of them. Infinite where they are exact nowhere yet.
     """
-    moduli, distance = objective.parameters.moduli(there.unknowns), 0.0
+    moduli, distance = objective.parameters.moduli(unknowns), 0.0
     for approximation in objective.approximations:
         exact = approximation.derivatives_at
         distance = np.inf if exact is None else max(distance, float(np.abs(np.log(moduli / exact)).max()))
-    return distance * np.maximum(posterior_sd(there, objective.n_parameters), LEAST_SD)
+    return distance
 
 
 def model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray[np.float64], SolveCounts]:
