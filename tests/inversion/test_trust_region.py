@@ -346,6 +346,36 @@ def test_a_step_longer_than_a_standard_deviation_tells_no_number_of_independent_
     assert counts[-1] != first
 
 
+@pytest.mark.parametrize(("last", "most"), [(False, 0.7), (True, 1.0)])
+def test_independent_residuals_are_counted_before_an_alternative_is_chosen(twins, twin, last, most):
+    """A wall that moves as smooth noise does explains it: by those of exact surfaces it would gain too much."""
+    noisy = twins.noisy_problem(twin, sd_mm=0.4, seed=2)
+    objective = twins.mixture(twins.objective_of(noisy, twin.coefficients), (1.0, 3.0), last=last)
+    start = begun(objective, np.concatenate([np.log([12.0, 12.0]), twin.coefficients]))
+    rule = replace(CHEAP, iterations=1)
+    end = minimised(start, twins.settings(0.5).bounds, rule, progress=twins.silent, title="")
+    assert np.any(np.abs(end.minimum.unknowns - start.minimum.unknowns)[:2] > posterior_sd(end.minimum, 2))
+    assert end.objective.chosen
+    count = start.objective.n_independent
+    assert end.objective.n_independent <= most * count
+    assert not last or end.objective.n_independent == count
+
+
+def test_minima_are_compared_by_the_numbers_of_independent_residuals_of_the_one_that_has_the_fewest(found):
+    """Twice as many count twice for what explains the residuals: here nothing differs but they."""
+    end = end_of(found)
+    fewer = [
+        o.with_correlation(replace(o.noise_model, lengths=1.4 * o.noise_model.lengths))
+        for o in end.objective.observations
+    ]
+    few = replace(end, objective=end.objective.with_observations(fewer))
+    assert few.objective.n_independent < 0.6 * end.objective.n_independent
+    alike = trust_region.totals_counted_alike([end, few])
+    assert alike[0] == pytest.approx(alike[1])
+    assert alike[1] == pytest.approx(trust_region.total_counted_as(end, few))
+    assert abs(trust_region.total_counted_as(end, end) - alike[0]) > 1.0
+
+
 def test_bounds_hold_and_what_they_hold_back_is_a_minimum(twins, voxels):
     narrow = twins.settings(1.0, limits=(0.5, 2.0))
     found = invert(voxels, narrow, progress=twins.silent)
