@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.inversion.objective import AS_GOOD, Evaluation, Objective
 from palpate.inversion.optimise import Bounds, Minimum, same_minimum
-from palpate.inversion.trust_region import NEAR, Convergence, OuterIterate, begun, minimised
+from palpate.inversion.trust_region import NEAR, Convergence, OuterIterate, begun, minimised, with_fewest
 from palpate.mechanics.forward import SolveCounts
 from palpate.progress import silent
 
@@ -112,13 +112,11 @@ def concluded(
 def compared(distinct: Sequence[OuterIterate], bounds: Bounds) -> tuple[list[float], int]:
     """The objective at each iterate, hyper-parameters at their best, and what it cost in evaluations.
 
-    All with the numbers of independent residuals of the one that has the fewest of those that converged: these are data
-    of an objective, and by too many of them what explains smooth noise seems clearly likelier.
+    All with the same numbers of independent residuals (see `with_fewest`).
     """
     if len(distinct) == 1:
         return [distinct[0].objective.total(distinct[0].minimum.evaluation)], 0
-    ended = [iterate.objective for iterate in distinct if iterate.minimum.converged] or [distinct[0].objective]
-    reference = min(ended, key=lambda objective: objective.n_independent)
+    reference = with_fewest(distinct).objective
     values, evaluations = [], 0
     for iterate in distinct:
         begin = begun(iterate.objective.counted_as(reference), iterate.minimum.unknowns)

@@ -32,7 +32,7 @@ from palpate.inversion.trust_region import (
     begun,
     minimised,
     total_counted_as,
-    totals_counted_alike,
+    with_fewest,
 )
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
@@ -234,8 +234,8 @@ def _linear(
         belongs[groups[number]], spent = len(ends), spent + end.minimum.evaluations
         ends.append(end)
     same = grouped([end.minimum for end in ends], n)
-    pairs = zip(ends, totals_counted_alike(ends), strict=True)
-    totals = [total if end.minimum.converged else np.inf for end, total in pairs]
+    fewest = with_fewest(ends)
+    totals = [total_counted_as(end, fewest) if end.minimum.converged else np.inf for end in ends]
     best = [min(members(same, g), key=lambda i: totals[i]) for g in range(max(same) + 1)]
     order = sorted(best, key=lambda i: totals[i])
     followed = list[OuterIterate]()

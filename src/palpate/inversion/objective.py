@@ -167,6 +167,11 @@ class Objective:
         return [observation for state in self.states for observation in state.observations]
 
     @property
+    def n_independent(self) -> float:
+        """Number of independent residuals of all observations."""
+        return sum(o.weighting.count for o in self.observations)
+
+    @property
     def approximations(self) -> list[Approximation]:
         """What stands in for each state's model."""
         found = [state.approximation for state in self.states if state.approximation is not None]
@@ -212,11 +217,6 @@ class Objective:
         left = iter(observations)
         states = [state.with_observations([next(left) for _ in state.observations]) for state in self.states]
         return replace(self, states=tuple(states))
-
-    @property
-    def n_independent(self) -> float:
-        """Number of independent residuals of all observations."""
-        return sum(o.weighting.count for o in self.observations)
 
     def counted_as(self, other: Objective) -> Objective:
         """The same with the numbers of independent residuals of another one, under which both may be compared."""

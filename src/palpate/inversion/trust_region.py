@@ -101,7 +101,8 @@ class OuterIterate:
     """Where an iteration ended: a minimum under the objective that it was found with.
 
     checks: what it cost to state the approximations' errors; totals: J before and after each accepted step, by one
-    linearisation's determinants; correlated: how often the numbers of independent residuals have been taken anew.
+    linearisation's determinants; correlated: how often a step was so short that the numbers of independent residuals
+    could be taken anew.
     """
 
     objective: Objective
@@ -279,7 +280,8 @@ def _chosen_afresh(now: OuterIterate) -> OuterIterate:
 
 def _likeliest(ends: Sequence[OuterIterate], last: OuterIterate) -> OuterIterate:
     """Of minima under other alternatives that with the least J; the cost is that of all, up to the `last` iteration."""
-    best = ends[int(np.argmin(totals_counted_alike(ends)))]
+    fewest = with_fewest(ends)
+    best = min(ends, key=lambda end: total_counted_as(end, fewest))
     if best.minimum.evaluations == last.minimum.evaluations:
         return best
     spent = last.counts - replace(best, checks=SolveCounts()).counts
@@ -292,10 +294,13 @@ def total_counted_as(iterate: OuterIterate, other: OuterIterate) -> float:
     return objective.total(LinearisedObjective(objective, at.unknowns, at.evaluation)(at.unknowns))
 
 
-def totals_counted_alike(iterates: Sequence[OuterIterate]) -> list[float]:
-    """J where each iteration ended, all with the numbers of independent residuals of the one that has the fewest."""
-    fewest = min(iterates, key=lambda iterate: iterate.objective.n_independent)
-    return [total_counted_as(iterate, fewest) for iterate in iterates]
+def with_fewest(iterates: Sequence[OuterIterate]) -> OuterIterate:
+    """The one with the fewest independent residuals, by which all are compared, of those that converged where one did.
+
+    These numbers are data of an objective, and by too many of them what explains smooth noise seems clearly likelier.
+    """
+    ended = [iterate for iterate in iterates if iterate.minimum.converged]
+    return min(ended or iterates, key=lambda iterate: iterate.objective.n_independent)
 
 
 def _numbers(objective: Objective) -> tuple[int | None, ...]:
@@ -308,8 +313,8 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
 
     In turn, each of which lowers it: unknowns under given hyper-parameters, and these (see `with_hyper_parameters`).
     Where the step is damped hyper-parameters stay. The numbers of independent residuals are taken anew before blocks
-    have their first choice, for those of voxels' rounding are many more than those of smooth noise, of which a frame or
-    a wall that moves explains much then; and from then on some times, where neither the trust region ends the step nor
+    have their first alternative, for smooth noise has far fewer than voxels' rounding, and by too many a frame or a
+    wall that follows it seems certain; and from then on some times, where neither the trust region ends the step nor
     it is longer than a standard deviation of some log-modulus, for what is still motion is alike over whole surfaces.
     """
     objective, at, n = start.objective, start.minimum, start.objective.n_parameters
