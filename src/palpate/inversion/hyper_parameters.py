@@ -9,19 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize
 
 from palpate.approximation.contract import determined
-from palpate.inversion.objective import (
-    AS_GOOD,
-    Evaluation,
-    Linearisation,
-    Objective,
-    worse_driver,
-)
+from palpate.inversion.objective import AS_GOOD, Evaluation, Linearisation, Objective, worse_driver
 from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns.blocks import Acts, Block
@@ -202,22 +197,23 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     """
     parameters, n = objective.parameters, objective.n_parameters
     chosen = list(objective.chosen or (None,) * len(parameters.blocks))
+    rare = list(objective.rare or (0.0,) * len(parameters.blocks))
     model, prior = _normal_model(parameters, evaluation, unknowns), evaluation.prior.copy()
 
-    def choice(i: int) -> tuple[float, int, NDArray[np.float64]]:
-        """What a block gains by its best alternative, the number of the one it takes, and that one's covariance."""
+    def choice(i: int) -> tuple[float, int, _Belief]:
+        """What a block gains by its best alternative, the number of the one it takes, and what that one believes."""
         block, beliefs = parameters.blocks[i], model.beliefs(i, chosen, prior)
-        best = max(range(len(beliefs)), key=lambda k: beliefs[k][0])
+        best = max(range(len(beliefs)), key=lambda k: beliefs[k].evidence)
         present = chosen[i] if chosen[i] in range(len(beliefs)) else None
         if present is None and block.acts is Acts.MATERIAL:
             present = 0
         if present is None and objective.learn_last and block.slight and best == 1:
             beliefs, present = model.beliefs_beside(i, chosen, prior)[:2], 0
         if present is None:
-            return np.inf, best, beliefs[best][1]
-        gain = beliefs[best][0] - beliefs[present][0]
+            return np.inf, best, beliefs[best]
+        gain = beliefs[best].evidence - beliefs[present].evidence
         taken = best if gain > AS_GOOD else present
-        return gain, taken, beliefs[taken][1]
+        return gain, taken, beliefs[taken]
 
     learned = [i for i, block in enumerate(parameters.blocks) if block.alternatives]
     last = [i for i in learned if parameters.blocks[i].last]
@@ -226,10 +222,10 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
             choices = {i: choice(i) for i in waiting}
             i = max(waiting, key=lambda k: choices[k][0])
             waiting.remove(i)
-            _, chosen[i], believed = choices[i]
-            prior = model.believed(i, believed, prior)
+            _, chosen[i], taken = choices[i]
+            rare[i], prior = taken.rare, model.believed(i, taken.covariance, prior)
     parameters = replace(parameters, nuisance_precision=prior[n:, n:])
-    return replace(objective, parameters=parameters, chosen=tuple(chosen))
+    return replace(objective, parameters=parameters, chosen=tuple(chosen), rare=tuple(rare))
 
 
 def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
@@ -287,14 +283,14 @@ def undecided_covariance(
             if not block.odds:
                 continue
             beliefs = model.beliefs(i, numbers, prior)
-            evidences = np.array([evidence for evidence, _ in beliefs])
+            evidences = np.array([belief.evidence for belief in beliefs])
             shares = np.exp(evidences - evidences.max())
             shares /= shares.sum()
             part = np.zeros((n, n))
-            for k, (_, believed) in enumerate(beliefs):
+            for k, belief in enumerate(beliefs):
                 if k == chosen:
                     continue
-                moved, spread = posterior(model.believed(i, believed, prior))
+                moved, spread = posterior(model.believed(i, belief.covariance, prior))
                 part += shares[k] * (spread - covariance + np.outer(moved - mean, moved - mean))
             sizes, axes = np.linalg.eigh(part)  # an alternative that knows more makes nothing narrower
             found[block.cause] = found.get(block.cause, np.zeros((n, n))) + (axes * np.maximum(sizes, 0.0)) @ axes.T
@@ -314,6 +310,14 @@ def _normal_model(parameters: ParameterMap, evaluation: Evaluation, unknowns: ND
     return _NormalModel(parameters, data, data @ unknowns - (evaluation.score - evaluation.prior_score))
 
 
+class _Belief(NamedTuple):
+    """An alternative of a block at its best: log-evidence with all log priors, covariance (m, m), -ln p(a) there."""
+
+    evidence: float
+    covariance: NDArray[np.float64]
+    rare: float
+
+
 @dataclass(frozen=True, slots=True)
 class _NormalModel:
     """Linear residuals: the information A = J^T W J of all unknowns, `data` (n, n), and the pull A x - J^T W r (n,)."""
@@ -322,32 +326,25 @@ class _NormalModel:
     data: NDArray[np.float64]
     pull: NDArray[np.float64]
 
-    def beliefs(
-        self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]
-    ) -> list[tuple[float, NDArray[np.float64]]]:
-        """Log-evidence and covariance (m, m) of each alternative of block i at its best, others under a prior (n, n).
-
-        Of the alternatives that those `chosen` for the others leave it.
-        """
+    def beliefs(self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]) -> list[_Belief]:
+        """Those of block i that the alternatives `chosen` for the others leave it, others under a prior (n, n)."""
         block, places = _admissible(self.parameters.blocks, i, chosen), self.parameters.columns(i)
         pull, odds = self.pull + prior @ self.parameters.prior_centre, block.odds or (0.0,) * len(block.alternatives)
         with determined():
             seen = _seen(self.data + prior, self.data, pull, places).whitened()
             return [_most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)]
 
-    def beliefs_beside(
-        self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]
-    ) -> list[tuple[float, NDArray[np.float64]]]:
+    def beliefs_beside(self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]) -> list[_Belief]:
         """The same, each with what its rivals gain beside it by more than what is as good, over their first ones."""
-        found, cause = list[tuple[float, NDArray[np.float64]]](), self.parameters.blocks[i].cause
+        found, cause = list[_Belief](), self.parameters.blocks[i].cause
         rivals = [j for j, block in enumerate(self.parameters.blocks) if cause in block.rivals]
         for j in rivals:
             prior = self.believed(j, self.parameters.blocks[j].alternatives[0][0], prior)
-        for k, (evidence, covariance) in enumerate(self.beliefs(i, chosen, prior)):
-            beside, among = self.believed(i, covariance, prior), [k if j == i else of for j, of in enumerate(chosen)]
-            evidences = [[of for of, _ in self.beliefs(j, among, beside)] for j in rivals]
+        for k, own in enumerate(self.beliefs(i, chosen, prior)):
+            beside, among = self.believed(i, own.covariance, prior), [*chosen[:i], k, *chosen[i + 1 :]]
+            evidences = [[of.evidence for of in self.beliefs(j, among, beside)] for j in rivals]
             gains = [max(of) - of[0] for of in evidences]
-            found.append((evidence + sum(gain for gain in gains if gain > AS_GOOD), covariance))
+            found.append(own._replace(evidence=own.evidence + sum(gain for gain in gains if gain > AS_GOOD)))
         return found
 
     def believed(self, i: int, covariance: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -376,23 +373,27 @@ def _seen(
     return _Seen(0.5 * (information + information.T), pull[places] - followed[:, -1])
 
 
-def _most_evident(
-    terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: Block, odds: float
-) -> tuple[float, NDArray[np.float64]]:
-    """The largest log-evidence, with its log prior odds, of a family of priors of a block; its covariance (n, n)."""
+def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: Block, odds: float) -> _Belief:
+    """The largest log-evidence, with the log priors of odds and amplitudes, of a family of priors of a block.
+
+    Of terms that explain the same the evidence is a long valley with more than one end, which the amplitudes' law bars.
+    """
     floor = 0.0 if block.acts is Acts.MATERIAL else LEAST_VARIANCE  # a field's levels leave no mode without variance
     floored = [term + floor * np.eye(len(term)) for term in terms]
-    evidence = seen.log_evidence(floored)
+    evidence, limits, (mean, sd) = seen.log_evidence(floored), np.log(block.amplitudes), block.log_amplitude
+
+    def rare(logs: NDArray[np.float64]) -> float:
+        """-ln p of ln of the amplitudes (n_terms,), up to a constant."""
+        return 0.5 * float(np.sum(((logs - mean) / sd) ** 2))
 
     def worse(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """Minus the log-evidence at ln of the amplitudes (n_terms,), with its derivative."""
+        """Minus the log-evidence and log prior at ln of the amplitudes (n_terms,), with its derivative."""
         squares = np.exp(2.0 * logs)
         value, slopes = evidence(squares)
-        return -value, -2.0 * squares * slopes
+        return rare(logs) - value, (logs - mean) / sd**2 - 2.0 * squares * slopes
 
-    limits = np.log(block.amplitudes)
     start, bounds = np.zeros(len(terms)).clip(*limits), [tuple(limits)] * len(terms)
-    # to its end: terms that explain the same make a long valley
     best = optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
     squares = np.exp(2.0 * best.x)
-    return odds - float(best.fun), sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))
+    covariance = sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))
+    return _Belief(odds - float(best.fun), covariance, rare(best.x))
