@@ -22,9 +22,9 @@ class Told(str):
 
     def __new__(cls, sentence: str, stage: Stage) -> Told:
         """The sentence with its stage."""
-        told = super().__new__(cls, sentence)
-        told.stage = stage
-        return told
+        made = super().__new__(cls, sentence)
+        made.stage = stage
+        return made
 
     stage: Stage
 

@@ -17,8 +17,9 @@ from palpate.inversion import (
     with_first_noise,
     with_hyper_parameters,
 )
-from palpate.inversion.hyper_parameters import fitted_noise, undecided_covariance, with_amplitudes, with_scales
+from palpate.inversion.hyper_parameters import fitted_noise, with_amplitudes, with_scales
 from palpate.observation.noise_model import NoiseModel
+from palpate.uncertainty.alternatives import undecided_covariance
 from palpate.unknowns import Block
 from palpate.unknowns.blocks import Acts
 

@@ -9,9 +9,9 @@ import pytest
 
 from palpate.inversion import LaterState, invert, posterior_sd
 from palpate.inversion import informed_subspace as informed
-from palpate.inversion.hyper_parameters import undecided_covariance
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.material import material_modes
+from palpate.uncertainty.alternatives import undecided_covariance
 from palpate.unknowns import Acts, Block, material_blocks, parameter_map, unit_blocks
 
 

@@ -47,7 +47,7 @@ class Inversion:
     """The distinct minima, the number of the best one, every start, and the evaluation at no motion (`rest`).
 
     evaluations, counts: of everything that was followed to find and compare them, not of the best one alone. released:
-    the best one followed on with those blocks free that are held while it is sought (see `Block.released`); None where
+    the best one followed on with those blocks free that are fixed while it is sought (see `Block.released`); None where
     there are none, or where the best one itself has them free. unsettled: why it did not end, "" where it did.
     """
 
@@ -72,15 +72,15 @@ class Inversion:
 
     @property
     def convergence(self) -> Convergence:
-        """What the best minimum's last outer iteration left open."""
+        """What the best minimum's last outer iteration left unmet."""
         return self.candidates[self.best].iterate.convergence
 
 
 def as_good(value: float, best: float, *, scale: float = 1.0) -> bool:
-    """Whether a minimum with a `value` of minus the log-posterior cannot be told from one with the value `best`.
+    """Whether a minimum of a `value` of minus the log posterior is as likely as one of `best`, as far as data can say.
 
     By the rule of a 95 % interval: twice their difference, times a `scale` of the deviance (see `Profile`), is below
-    1.96^2. What a value is worth does not depend on how many residuals make it up.
+    1.96^2. A difference does not depend on how many residuals make it up.
     """
     return scale * (value - best) < AS_GOOD
 

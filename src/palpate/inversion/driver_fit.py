@@ -34,9 +34,9 @@ def fit_driver(
     Under the states' finite-strain law, where they have one, every share is in equilibrium. Raises `NotConverged` when
     the driver's wall cannot be brought to the images, or a path ends early.
     """
-    held = Objective(problem.states, replace(problem.parameters, base=moduli))
+    objective = Objective(problem.states, replace(problem.parameters, base=moduli))
     linear = [reduced_basis(state.model, moduli) for state in problem.states]
-    amounts = _fitted(held, linear, np.zeros(problem.parameters.n_coefficients))
+    amounts = _fitted(objective, linear, np.zeros(problem.parameters.n_coefficients))
     if not problem.finite_strain:
         motions = [basis.model.solve(moduli, q).displacement for basis, q in zip(linear, amounts, strict=True)]
         return tuple(tuple(share * motion for share in shares) for motion in motions)
@@ -45,7 +45,7 @@ def fit_driver(
         assert state.finite_strain is not None
         coarse = coarse_equilibrium(state.finite_strain, basis, LinearisationPoint(moduli, q))
         first.append(expansion_around(coarse, tolerance=ACCURACY))
-    amounts = _fitted(held, first, np.concatenate(amounts))
+    amounts = _fitted(objective, first, np.concatenate(amounts))
     found = []
     for near, q in zip([expansion.equilibrium for expansion in first], amounts, strict=True):
         states, offset = list[NDArray[np.float64]](), near.model.constraint.offset
@@ -59,15 +59,17 @@ def fit_driver(
 
 
 def _fitted(
-    held: Objective, models: Sequence[Approximation], coefficients: NDArray[np.float64]
+    objective: Objective, models: Sequence[Approximation], coefficients: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
     """Driver coefficients of each state that bring the walls to the images, from given ones, all in one row."""
-    begin = np.concatenate([np.zeros(held.n_parameters), coefficients])
-    bounds = Bounds(*np.outer([-1.0, 1.0], np.ones(held.n_parameters)))
-    objective = held.under(models).with_observations([o.with_noise(SEGMENTATION_NOISE) for o in held.observations])
+    begin = np.concatenate([np.zeros(objective.n_parameters), coefficients])
+    bounds = Bounds(*np.outer([-1.0, 1.0], np.ones(objective.n_parameters)))
+    objective = objective.under(models).with_observations(
+        [o.with_noise(SEGMENTATION_NOISE) for o in objective.observations]
+    )
     first = fit_coefficients(objective, begin, bounds=bounds)
     objective = with_amplitudes(objective, first.evaluation, first.unknowns)
     found = minimised(begun(objective, first.unknowns), bounds, ON_WALL, progress=silent, title="", fixed=True).minimum
     if not found.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
-    return held.parameters.coefficients(found.unknowns)
+    return objective.parameters.coefficients(found.unknowns)

@@ -66,9 +66,9 @@ def invert(
 
     States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle start
     and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows ends near.
-    At last blocks that were held are released, see `with_released`.
-    Raises `ConfigurationError` for an open Poisson's ratio with another law, `EstimationError`s of solving; an estimate
-    that did not converge says so in its minimum's outcome.
+    At last blocks that were fixed are released, see `with_released`.
+    Raises `ConfigurationError` for an unknown Poisson's ratio with another law, `EstimationError`s of solving; an
+    estimate that did not converge says so in its minimum's outcome.
     """
     if problem.finite_strain and problem.parameters.poisson:
         raise ConfigurationError(
@@ -144,26 +144,26 @@ def continue_at_finite_strain(
 def with_released(
     inversion: Inversion, settings: InversionSettings, *, progress: Progress, rule: StopRule
 ) -> Inversion:
-    """The inversion with its best minimum followed on with those blocks free that were held (see `Block.released`).
+    """The inversion with its best minimum followed on with those blocks free that were fixed (see `Block.released`).
 
     Where J, with their prior odds and the same numbers of independent residuals, is then less by more than what is as
-    good, the images tell of what was held, and this is the estimate, followed until it ends by the `rule`. Where it
+    good, the images tell of what was fixed, and this is the estimate, followed until it ends by the `rule`. Where it
     does not end the inversion says why. Nothing changes where there is no such block, or no minimum to follow.
     """
     best = inversion.candidates[inversion.best]
-    held, released = best.iterate, [block for block in inversion.objective.parameters.blocks if block.released]
-    if not held.minimum.converged or not released:
+    fixed, released = best.iterate, [block for block in inversion.objective.parameters.blocks if block.released]
+    if not fixed.minimum.converged or not released:
         return inversion
-    unknowns, bounds = held.minimum.unknowns, settings.bounds
+    unknowns, bounds = fixed.minimum.unknowns, settings.bounds
     title = f"with {' and '.join(dict.fromkeys(block.cause for block in released))} free"
     try:
-        objective, evaluation = held.objective.released(held.minimum.evaluation, unknowns)
-        places = objective.linearisation_points(unknowns, evaluation)
-        near = [known.update(place) for known, place in zip(objective.approximations, places, strict=True)]
-        start = replace(begun(objective.under(near), unknowns), checks=held.checks)
+        objective, evaluation = fixed.objective.released(fixed.minimum.evaluation, unknowns)
+        points = objective.linearisation_points(unknowns, evaluation)
+        near = [known.update(point) for known, point in zip(objective.approximations, points, strict=True)]
+        start = replace(begun(objective.under(near), unknowns), checks=fixed.checks)
         end = free = minimised(start, bounds, NEAR, progress=progress, title=title)
-        inversion = replace(_followed(inversion, held, free), released=free)
-        gain = held.objective.total(held.minimum.evaluation) - total_counted_as(free, held)
+        inversion = replace(_followed(inversion, fixed, free), released=free)
+        gain = fixed.objective.total(fixed.minimum.evaluation) - total_counted_as(free, fixed)
         gain += min(block.released_odds for block in released)
         if free.minimum.converged and gain > AS_GOOD:
             start = replace(free, minimum=replace(free.minimum, evaluations=0))
@@ -176,7 +176,7 @@ def with_released(
         return replace(inversion, unsettled=end.minimum.outcome.value)
     if end is free:
         return inversion
-    history = (*held.minimum.history, *free.minimum.history[1:], *end.minimum.history[1:])
+    history = (*fixed.minimum.history, *free.minimum.history[1:], *end.minimum.history[1:])
     end = replace(end, minimum=replace(end.minimum, history=history))
     candidates = list(inversion.candidates)
     candidates[inversion.best] = replace(best, iterate=end, value=best.value - gain)
@@ -248,9 +248,9 @@ def _linear(
         spent += end.minimum.evaluations
         history = ends[number].minimum.history + end.minimum.history[1:]
         followed.append(replace(end, minimum=replace(end.minimum, history=history)))
-    place = {number: order.index(best[same[number]]) for number in range(len(ends))}
+    rank = {number: order.index(best[same[number]]) for number in range(len(ends))}
     starts = tuple(
-        StartRun(theta, minimum, place[belongs[group]] if group in belongs else None)
+        StartRun(theta, minimum, rank[belongs[group]] if group in belongs else None)
         for theta, minimum, group in zip(settings.every_start, screened, groups, strict=True)
     )
     found = concluded(followed, starts, rest, bounds, 0)
@@ -283,11 +283,11 @@ def _coarse(linear: OuterIterate) -> tuple[Objective, list[FiniteStrainEquilibri
 
     Its states bend as the linear law does.
     """
-    before, places = linear.objective, linear.objective.linearisation_points(linear.minimum.unknowns)
+    before, points = linear.objective, linear.objective.linearisation_points(linear.minimum.unknowns)
     found, states = list[FiniteStrainEquilibrium](), list[LaterState]()
-    for state, basis, place in zip(before.states, before.approximations, places, strict=True):
+    for state, basis, point in zip(before.states, before.approximations, points, strict=True):
         assert state.finite_strain is not None
-        found.append(coarse_equilibrium(state.finite_strain, basis, place))
+        found.append(coarse_equilibrium(state.finite_strain, basis, point))
         states.append(replace(state, approximation=None, bending=state.observed))
     return replace(before, states=tuple(states)), found
 
@@ -305,10 +305,10 @@ def _expanded(
 def _at_equilibrium(end: OuterIterate, before: tuple[Iterate, ...]) -> OuterIterate:
     """The end of an outer loop at exact equilibria; `before`: the way to where it began."""
     exact = []
-    places = end.objective.linearisation_points(end.minimum.unknowns)
-    for approximation, place in zip(end.objective.approximations, places, strict=True):
+    points = end.objective.linearisation_points(end.minimum.unknowns)
+    for approximation, point in zip(end.objective.approximations, points, strict=True):
         assert isinstance(approximation, Expansion)
-        exact.append(approximation.at_equilibrium(place, tolerance=ACCURACY))
+        exact.append(approximation.at_equilibrium(point, tolerance=ACCURACY))
     final = end.objective.under(exact)
     evaluation, spent = final(end.minimum.unknowns), end.minimum.evaluations + 1
     minimum = replace(end.minimum, evaluation=evaluation, evaluations=spent, history=before + end.minimum.history)

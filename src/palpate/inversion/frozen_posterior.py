@@ -1,4 +1,4 @@
-"""The objective near an estimate with its closest points, weights and hyper-parameters held.
+"""The objective near an estimate with its closest points, weights and hyper-parameters fixed.
 
 Every residual is then linear in the displacement: a smooth least-squares problem, of which profiles are taken. On a
 reduced model it is a quadratic form in the model's amplitudes: an evaluation forgets mesh and surfaces.
@@ -30,13 +30,13 @@ class FixedCorrespondence:
     weights w_0 there, as in the Gauss-Newton matrix: J = 1/2 sum_j precision w_0j r_j^2 + prior. What re-chosen closest
     points add, some tenths of a unit, is noise beside its second derivative, and far away a robust loss would take
     every residual for an outlier. unknowns (n_unknowns,): those of the evaluation; models: of each state, at its
-    observed unknowns; displacements: u_0 (n_dofs,) mm of each line.
+    observed unknowns; displacements: u_0 (n_dofs,) mm of each linearisation.
     """
 
     objective: Objective
     unknowns: NDArray[np.float64]
     models: tuple[ForwardModel, ...]
-    lines: tuple[Linearisation, ...]
+    linearisations: tuple[Linearisation, ...]
     displacements: tuple[NDArray[np.float64], ...]
 
     @property
@@ -46,28 +46,28 @@ class FixedCorrespondence:
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J at `unknowns` (n_unknowns,) with score and Gauss-Newton matrix; raises `SolverError`."""
-        mapping, lines = self.objective.parameters, list[Linearisation]()
-        left = iter(zip(self.lines, self.displacements, strict=True))
+        mapping, found = self.objective.parameters, list[Linearisation]()
+        left = iter(zip(self.linearisations, self.displacements, strict=True))
         moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
         for s, (state, model, q) in enumerate(zip(self.objective.states, self.models, coefficients, strict=True)):
             there = model.solve(moduli, q)
             tangent = mapping.by_unknowns(there.tangent(), unknowns)
             offset = mapping.offsets(unknowns - self.unknowns, s)
-            for rows, (line, before) in zip(state.slices, left, strict=False):
-                n_dofs, by_offset = len(before), line.jacobian.tangent[len(before), tangent.shape[1] :] @ offset
-                material = line.jacobian.tangent[n_dofs + 1 :] @ (unknowns - self.unknowns)[line.columns]
+            for rows, (term, before) in zip(state.slices, left, strict=False):
+                n_dofs, by_offset = len(before), term.jacobian.tangent[len(before), tangent.shape[1] :] @ offset
+                material = term.jacobian.tangent[n_dofs + 1 :] @ (unknowns - self.unknowns)[term.columns]
                 moved = np.concatenate([there.values[rows] - before, [by_offset], material])
-                values = line.residuals.values + line.jacobian.by_displacement @ moved
-                jacobian = line.jacobian.under(tangent[rows])
-                residuals = replace(line.residuals, values=values)
-                lines.append(Linearisation.of(line.observation, s, residuals, line.columns, jacobian, line.weights))
-        return self.assembled(unknowns, lines)
+                values = term.residuals.values + term.jacobian.by_displacement @ moved
+                jacobian = term.jacobian.under(tangent[rows])
+                residuals = replace(term.residuals, values=values)
+                found.append(Linearisation.of(term.observation, s, residuals, term.columns, jacobian, term.weights))
+        return self.assembled(unknowns, found)
 
-    def assembled(self, unknowns: NDArray[np.float64], lines: Sequence[Linearisation]) -> Evaluation:
+    def assembled(self, unknowns: NDArray[np.float64], linearisations: Sequence[Linearisation]) -> Evaluation:
         """J at `unknowns` (n_unknowns,) where its linearisations there are known."""
-        found = self.objective.assembled(unknowns, lines)
+        found = self.objective.assembled(unknowns, linearisations)
         away = float((unknowns - self.objective.parameters.prior_centre) @ found.prior_score)
-        squares = sum(line.precision * float(line.weights @ line.residuals.values**2) for line in lines)
+        squares = sum(term.precision * float(term.weights @ term.residuals.values**2) for term in linearisations)
         return replace(found, value=0.5 * (away + squares))
 
 
@@ -198,12 +198,12 @@ def frozen_posterior(
                 f"the posterior is frozen on reduced models; state {s} has a {type(model).__name__}"
             )
         answer = np.concatenate([reduced.output_basis, reduced.output_modes, reduced.output_material], axis=1)
-        lines = [line for line in evaluation.linearisations if line.state == s]
-        expanded = moduli if any(line.residuals.direct is not None for line in lines) else None
+        linearisations = [term for term in evaluation.linearisations if term.state == s]
+        expanded = moduli if any(term.residuals.direct is not None for term in linearisations) else None
         if expanded is not None:
             answer = np.pad(answer, ((0, 0), (0, len(moduli))))
         if isinstance(model, CurvedModel):
-            rest, expanded = model.expansion.derivatives - model.straight.derivatives, model.expansion.moduli
+            rest, expanded = model.expansion.derivatives - model.linear.derivatives, model.expansion.moduli
             modes = slice(reduced.n_basis, reduced.n_basis + model.n_modes)
             answer[:, modes] += rest[:, model.n_regions :]
             answer = np.concatenate([answer[:, : modes.stop], rest[:, : model.n_regions]], axis=1)
@@ -211,19 +211,19 @@ def frozen_posterior(
         bare = FrozenState(reduced.outputs(lambda values: values[:0]), expanded, *(np.zeros((0, 0)),) * 2)
         z = bare.coordinates(bare.reduced.solve(moduli, coefficients[s]).amplitude, moduli, coefficients[s], offsets)
         form, square = np.zeros((len(z), len(z))), np.zeros((len(z), len(z)))
-        for rows, line in zip(objective.states[s].slices, lines, strict=True):
-            of_offsets = line.jacobian.tangent[:, line.jacobian.shape[1] - len(offsets) :]
+        for rows, term in zip(objective.states[s].slices, linearisations, strict=True):
+            of_offsets = term.jacobian.tangent[:, term.jacobian.shape[1] - len(offsets) :]
             below = np.zeros((len(of_offsets) - len(answer[rows]), answer.shape[1]))
-            if line.residuals.direct is not None:  # z holds the material's coefficients, then ln E - ln E_0
+            if term.residuals.direct is not None:  # z holds the material's coefficients, then ln E - ln E_0
                 n_regions, first = len(moduli), reduced.n_basis + reduced.n_boundary
                 below[1 : 1 + n_regions, -n_regions:] = np.eye(n_regions)
                 below[1 + n_regions :, first : first + len(below) - 1 - n_regions] = np.eye(len(below) - 1 - n_regions)
             moved = np.concatenate([np.concatenate([answer[rows], below]), of_offsets], axis=1)
-            by_z = replace(line.jacobian, tangent=moved)
-            rest = line.residuals.values - by_z.times(z[:-1])
-            side = by_z.transposed_times(line.weights * rest)[:, None]
-            own = np.block([[by_z.gram(line.weights), side], [side.T, float(line.weights @ rest**2)]])
-            form += line.precision * own
+            by_z = replace(term.jacobian, tangent=moved)
+            rest = term.residuals.values - by_z.times(z[:-1])
+            side = by_z.transposed_times(term.weights * rest)[:, None]
+            own = np.block([[by_z.gram(term.weights), side], [side.T, float(term.weights @ rest**2)]])
+            form += term.precision * own
             square += own / len(evaluation.linearisations)
         states.append(replace(bare, form=form, square=square))
     return FrozenPosterior(objective, tuple(states), evaluation.prior)

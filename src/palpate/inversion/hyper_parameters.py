@@ -45,7 +45,7 @@ def with_correlations(objective: Objective, evaluation: Evaluation) -> Objective
 def with_hyper_parameters(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
     """A step of the hyper-parameters at unknowns (n_unknowns,), the residuals linear around their evaluation.
 
-    Raises `EstimationError` where the images leave a block's motion open.
+    Raises `EstimationError` where the images do not determine a block's motion.
     """
     learned = with_amplitudes(with_scales(objective, evaluation), evaluation, unknowns)
     return with_edges(learned, evaluation, unknowns)
@@ -57,27 +57,27 @@ def with_scales(objective: Objective, evaluation: Evaluation) -> Objective:
     d/d ln s of 1/2 ln det H is -g, g = tr H^-1 J^T W J the number of unknowns that the residuals determine (MacKay
     1992): s^2 = n rho / (n - g) of a mean square rho where no outlier is.
     """
-    lines, found, inverse = evaluation.linearisations, dict[int, float](), np.zeros_like(evaluation.matrix)
+    linearisations, found, inverse = evaluation.linearisations, dict[int, float](), np.zeros_like(evaluation.matrix)
     matrix = evaluation.matrix - evaluation.prior + objective.as_normal(evaluation)[0]
     seen = np.flatnonzero(np.diag(matrix) > 0.0)
     with determined():
         inverse[np.ix_(seen, seen)] = np.linalg.inv(matrix[np.ix_(seen, seen)])
     for own, telling in of_one_noise(evaluation).values():
-        pooled = _scale([lines[i] for i in telling], inverse, 0.0)
+        pooled = _scale([linearisations[i] for i in telling], inverse, 0.0)
         apart = [i for i in own if i not in telling]
-        found |= dict.fromkeys(own, pooled) | {i: _scale([lines[i]], inverse, pooled) for i in apart}
+        found |= dict.fromkeys(own, pooled) | {i: _scale([linearisations[i]], inverse, pooled) for i in apart}
     pairs = enumerate(objective.observations)
     return objective.with_observations([o.with_sd(found[i]) for i, o in pairs])
 
 
-def _scale(lines: Sequence[Linearisation], inverse: NDArray[np.float64], least: float) -> float:
+def _scale(linearisations: Sequence[Linearisation], inverse: NDArray[np.float64], least: float) -> float:
     """That of some observations' residuals, mm, at least `least`; inverse (n, n): H^-1."""
-    count = sum(line.observation.weighting.count for line in lines)
+    count = sum(term.observation.weighting.count for term in linearisations)
     determine = 0.0
-    for line in lines:
-        determine += float(np.sum(inverse[np.ix_(line.columns, line.columns)] * line.information))
-    low = max(least, *(line.observation.sd_bounds[0] for line in lines))
-    high = min(line.observation.sd_bounds[1] for line in lines)
+    for term in linearisations:
+        determine += float(np.sum(inverse[np.ix_(term.columns, term.columns)] * term.information))
+    low = max(least, *(term.observation.sd_bounds[0] for term in linearisations))
+    high = min(term.observation.sd_bounds[1] for term in linearisations)
     if high <= low:
         return low
     determine = min(determine, FITTED * count)
@@ -85,13 +85,13 @@ def _scale(lines: Sequence[Linearisation], inverse: NDArray[np.float64], least: 
     def worse(log_sd: float) -> float:
         """What the objective has of it at ln s."""
         total = -determine * log_sd
-        for line in lines:
-            weighting = line.observation.with_sd(float(np.exp(log_sd))).weighting
-            rho = float(line.residuals.weights @ weighting.loss.rho(line.residuals.values))
+        for term in linearisations:
+            weighting = term.observation.with_sd(float(np.exp(log_sd))).weighting
+            rho = float(term.residuals.weights @ weighting.loss.rho(term.residuals.values))
             total += 0.5 * weighting.precision * rho + weighting.log_normaliser
         return total if least == 0.0 else total + worse_driver(float(np.exp(log_sd)), least)
 
-    now = float(np.log(lines[0].observation.weighting.sd))
+    now = float(np.log(linearisations[0].observation.weighting.sd))
     ends = (max(np.log(low), now - 4.0), min(np.log(high), now + 4.0))
     if ends[1] <= ends[0]:
         return float(np.clip(np.exp(now), low, high))
@@ -104,9 +104,9 @@ def fitted_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
 
     Each later image has its own: one that was drawn badly would else take from what the others are believed.
     """
-    lines, groups = evaluation.linearisations, of_one_noise(evaluation)
-    telling = {key: [lines[i] for i in those] for key, (_, those) in groups.items()}
-    return {key: of[0].observation.fitted_noise([line.residuals for line in of]) for key, of in telling.items()}
+    linearisations, groups = evaluation.linearisations, of_one_noise(evaluation)
+    telling = {key: [linearisations[i] for i in those] for key, (_, those) in groups.items()}
+    return {key: of[0].observation.fitted_noise([each.residuals for each in of]) for key, of in telling.items()}
 
 
 def of_one_noise(evaluation: Evaluation) -> dict[tuple[int, str], tuple[list[int], list[int]]]:
@@ -115,10 +115,10 @@ def of_one_noise(evaluation: Evaluation) -> dict[tuple[int, str], tuple[list[int
     Modes flatten a driver's residuals: they tell where nothing else is seen.
     """
     groups: dict[tuple[int, str], tuple[list[int], list[int]]] = {}
-    for i, line in enumerate(evaluation.linearisations):
-        own, telling = groups.setdefault((line.state, line.observation.kind), ([], []))
+    for i, term in enumerate(evaluation.linearisations):
+        own, telling = groups.setdefault((term.state, term.observation.kind), ([], []))
         own.append(i)
-        telling += [] if line.observation.of_driver else [i]
+        telling += [] if term.observation.of_driver else [i]
     return {key: (own, telling or own) for key, (own, telling) in groups.items()}
 
 
@@ -198,9 +198,9 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     parameters, n = objective.parameters, objective.n_parameters
     chosen = list(objective.chosen or (None,) * len(parameters.blocks))
     rare = list(objective.rare or (0.0,) * len(parameters.blocks))
-    model, prior = _normal_model(parameters, evaluation, unknowns), evaluation.prior.copy()
+    model, prior = normal_model(parameters, evaluation, unknowns), evaluation.prior.copy()
 
-    def choice(i: int) -> tuple[float, int, _Belief]:
+    def choice(i: int) -> tuple[float, int, Belief]:
         """What a block gains by its best alternative, the number of the one it takes, and what that one believes."""
         block, beliefs = parameters.blocks[i], model.beliefs(i, chosen, prior)
         best = max(range(len(beliefs)), key=lambda k: beliefs[k].evidence)
@@ -240,61 +240,19 @@ def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[n
     if not numbers:
         return objective
     prior, centre = parameters.prior_matrix, parameters.prior_centre
-    model = _normal_model(parameters, evaluation, unknowns)
+    model = normal_model(parameters, evaluation, unknowns)
     for i in numbers:
-        places, variation = parameters.columns(i), parameters.blocks[i].variation
+        columns, variation = parameters.columns(i), parameters.blocks[i].variation
         assert variation is not None
-        centre[places] = 0.0
+        centre[columns] = 0.0
         with determined():
-            seen = _seen(model.data + prior, model.data, model.pull + prior @ centre, places)
-            x = variation.least(seen.information, seen.pull, unknowns[places])
-            prior[np.ix_(places, places)] = curvature = variation.curvature(x)
+            seen = _seen(model.data + prior, model.data, model.pull + prior @ centre, columns)
+            x = variation.least(seen.information, seen.pull, unknowns[columns])
+            prior[np.ix_(columns, columns)] = curvature = variation.curvature(x)
             away = linalg.solve(curvature, variation.gradient(x), assume_a="pos")
-        centre[places] = x - away
+        centre[columns] = x - away
     believed = replace(parameters, nuisance_precision=prior[n:, n:], nuisance_mean=centre[n:])
     return replace(objective, parameters=believed)
-
-
-def undecided_covariance(
-    objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]
-) -> dict[str, NDArray[np.float64]]:
-    """What a covariance (n_parameters, n_parameters) lacks where alternatives were not decided, by the blocks' cause.
-
-    The second moment about the estimate of a mixture: sum_k w_k (V_k - V + d_k d_k^T) over the alternatives of a block
-    that were not chosen, with their posterior probability w_k by evidence and odds, the Gauss-Newton covariance V_k
-    of the log-moduli under each, and how far d_k it moves them, with the residuals linear around unknowns (n_unknowns,)
-    (law of total variance).
-    """
-    parameters, n, prior = objective.parameters, objective.n_parameters, evaluation.prior
-    model = _normal_model(parameters, evaluation, unknowns)
-
-    def posterior(of: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Mean (n,) and covariance (n, n) of the log-moduli under a prior's precision."""
-        right = np.column_stack([np.eye(len(of))[:, :n], model.pull + of @ parameters.prior_centre])
-        solved = linalg.solve(model.data + of, right, assume_a="pos", check_finite=False)
-        return solved[:n, n], solved[:n, :n]
-
-    found = dict[str, NDArray[np.float64]]()
-    numbers = objective.chosen or (None,) * len(parameters.blocks)
-    with determined():
-        mean, covariance = posterior(prior)
-        for i in range(len(parameters.blocks)):
-            block, chosen = parameters.blocks[i], numbers[i] or 0
-            if not block.odds:
-                continue
-            beliefs = model.beliefs(i, numbers, prior)
-            evidences = np.array([belief.evidence for belief in beliefs])
-            shares = np.exp(evidences - evidences.max())
-            shares /= shares.sum()
-            part = np.zeros((n, n))
-            for k, belief in enumerate(beliefs):
-                if k == chosen:
-                    continue
-                moved, spread = posterior(model.believed(i, belief.covariance, prior))
-                part += shares[k] * (spread - covariance + np.outer(moved - mean, moved - mean))
-            sizes, axes = np.linalg.eigh(part)  # an alternative that knows more makes nothing narrower
-            found[block.cause] = found.get(block.cause, np.zeros((n, n))) + (axes * np.maximum(sizes, 0.0)) @ axes.T
-    return found
 
 
 def _admissible(blocks: Sequence[Block], number: int, chosen: Sequence[int | None]) -> Block:
@@ -304,13 +262,13 @@ def _admissible(blocks: Sequence[Block], number: int, chosen: Sequence[int | Non
     return replace(block, alternatives=block.alternatives[:-1], odds=block.odds[:-1]) if rivals else block
 
 
-def _normal_model(parameters: ParameterMap, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> _NormalModel:
+def normal_model(parameters: ParameterMap, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> NormalModel:
     """That of residuals which are linear around unknowns (n,), where they were evaluated."""
     data = evaluation.matrix - evaluation.prior
-    return _NormalModel(parameters, data, data @ unknowns - (evaluation.score - evaluation.prior_score))
+    return NormalModel(parameters, data, data @ unknowns - (evaluation.score - evaluation.prior_score))
 
 
-class _Belief(NamedTuple):
+class Belief(NamedTuple):
     """An alternative of a block at its best: log-evidence with all log priors, covariance (m, m), -ln p(a) there."""
 
     evidence: float
@@ -319,24 +277,24 @@ class _Belief(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class _NormalModel:
+class NormalModel:
     """Linear residuals: the information A = J^T W J of all unknowns, `data` (n, n), and the pull A x - J^T W r (n,)."""
 
     parameters: ParameterMap
     data: NDArray[np.float64]
     pull: NDArray[np.float64]
 
-    def beliefs(self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]) -> list[_Belief]:
+    def beliefs(self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]) -> list[Belief]:
         """Those of block i that the alternatives `chosen` for the others leave it, others under a prior (n, n)."""
-        block, places = _admissible(self.parameters.blocks, i, chosen), self.parameters.columns(i)
+        block, columns = _admissible(self.parameters.blocks, i, chosen), self.parameters.columns(i)
         pull, odds = self.pull + prior @ self.parameters.prior_centre, block.odds or (0.0,) * len(block.alternatives)
         with determined():
-            seen = _seen(self.data + prior, self.data, pull, places).whitened()
+            seen = _seen(self.data + prior, self.data, pull, columns).whitened()
             return [_most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)]
 
-    def beliefs_beside(self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]) -> list[_Belief]:
+    def beliefs_beside(self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]) -> list[Belief]:
         """The same, each with what its rivals gain beside it by more than what is as good, over their first ones."""
-        found, cause = list[_Belief](), self.parameters.blocks[i].cause
+        found, cause = list[Belief](), self.parameters.blocks[i].cause
         rivals = [j for j, block in enumerate(self.parameters.blocks) if cause in block.rivals]
         for j in rivals:
             prior = self.believed(j, self.parameters.blocks[j].alternatives[0][0], prior)
@@ -349,31 +307,31 @@ class _NormalModel:
 
     def believed(self, i: int, covariance: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np.float64]:
         """A prior (n, n) with another covariance (m, m) of block i."""
-        places, found = self.parameters.columns(i), prior.copy()
+        columns, found = self.parameters.columns(i), prior.copy()
         with determined():
-            found[np.ix_(places, places)] = linalg.inv(covariance)
+            found[np.ix_(columns, columns)] = linalg.inv(covariance)
         return found
 
 
 def _seen(
-    matrix: NDArray[np.float64], data: NDArray[np.float64], pull: NDArray[np.float64], places: NDArray[np.int64]
+    matrix: NDArray[np.float64], data: NDArray[np.float64], pull: NDArray[np.float64], columns: NDArray[np.int64]
 ) -> _Seen:
-    """The Schur complement of the information `data` on the unknowns `places`, the others under their prior.
+    """The Schur complement of the information `data` on the unknowns `columns`, the others under their prior.
 
     matrix (n, n): the data's and the prior's; pull (n,): likewise, with the prior's mean.
     """
-    rest = np.setdiff1d(np.arange(len(pull)), places)
-    across = data[np.ix_(rest, places)]
+    rest = np.setdiff1d(np.arange(len(pull)), columns)
+    across = data[np.ix_(rest, columns)]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix)[rest], 1e-30))
     scaled = scale[:, None] * matrix[np.ix_(rest, rest)] * scale
     scaled[np.diag_indices_from(scaled)] += 1e-10  # a modulus that moves nothing
     right = scale[:, None] * np.column_stack([across, pull[rest]])
     followed = across.T @ (scale[:, None] * linalg.solve(scaled, right, assume_a="pos", check_finite=False))
-    information = data[np.ix_(places, places)] - followed[:, :-1]
-    return _Seen(0.5 * (information + information.T), pull[places] - followed[:, -1])
+    information = data[np.ix_(columns, columns)] - followed[:, :-1]
+    return _Seen(0.5 * (information + information.T), pull[columns] - followed[:, -1])
 
 
-def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: Block, odds: float) -> _Belief:
+def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: Block, odds: float) -> Belief:
     """The largest log-evidence, with the log priors of odds and amplitudes, of a family of priors of a block.
 
     Of terms that explain the same the evidence is a long valley with more than one end, which the amplitudes' law bars.
@@ -396,4 +354,4 @@ def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: 
     best = optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
     squares = np.exp(2.0 * best.x)
     covariance = sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))
-    return _Belief(odds - float(best.fun), covariance, rare(best.x))
+    return Belief(odds - float(best.fun), covariance, rare(best.x))

@@ -188,12 +188,12 @@ class Objective:
         moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
         if evaluation is None:
             return [LinearisationPoint(moduli, q) for q in coefficients]
-        directions, places = deciding_directions(evaluation, mapping.n_parameters), []
+        directions, points = deciding_directions(evaluation, mapping.n_parameters), []
         for s, q in enumerate(coefficients):
             own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
             metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
-            places.append(LinearisationPoint(moduli, q, chain @ directions[own], metric))
-        return places
+            points.append(LinearisationPoint(moduli, q, chain @ directions[own], metric))
+        return points
 
     def under(self, approximations: Sequence[Approximation]) -> Objective:
         """The same observations and weights with other approximations, one a state."""
@@ -201,7 +201,7 @@ class Objective:
         return replace(self, states=tuple(state.with_approximation(model) for state, model in pairs))
 
     def released(self, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> tuple[Objective, Evaluation]:
-        """The objective with those blocks free that were held, and its evaluation at unknowns (n_unknowns,)."""
+        """The objective with those blocks free that were fixed, and its evaluation at unknowns (n_unknowns,)."""
         objective = replace(self, parameters=self.parameters.released())
         before, (value, pull) = _prior(self.parameters, unknowns)[0], _prior(objective.parameters, unknowns)
         prior, moved = objective.parameters.prior_matrix, pull - evaluation.prior_score
@@ -227,21 +227,21 @@ class Objective:
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J with score, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
-        lines = [line for s in range(len(self.states)) for line in self._linearised(s, unknowns)]
-        return self.assembled(unknowns, lines)
+        found = [term for s in range(len(self.states)) for term in self._linearised(s, unknowns)]
+        return self.assembled(unknowns, found)
 
-    def assembled(self, unknowns: NDArray[np.float64], lines: Sequence[Linearisation]) -> Evaluation:
+    def assembled(self, unknowns: NDArray[np.float64], linearisations: Sequence[Linearisation]) -> Evaluation:
         """The evaluation at `unknowns` (n_unknowns,) from all observations' residuals there, with their derivatives."""
         value, pull = _prior(self.parameters, unknowns)
         prior = self.parameters.prior_matrix
         score, matrix, misfit = pull.copy(), prior.copy(), 0.0
-        for line in lines:
-            score[line.columns] += line.score
-            matrix[np.ix_(line.columns, line.columns)] += line.information
-            loss = _mean_loss(line.observation, line.residuals)
-            misfit += loss / len(lines)
-            value += 0.5 * line.precision * loss
-        return Evaluation(value, misfit, score, matrix, tuple(lines), prior, pull)
+        for term in linearisations:
+            score[term.columns] += term.score
+            matrix[np.ix_(term.columns, term.columns)] += term.information
+            loss = float(term.residuals.weights @ term.observation.weighting.loss.rho(term.residuals.values))
+            misfit += loss / len(linearisations)
+            value += 0.5 * term.precision * loss
+        return Evaluation(value, misfit, score, matrix, tuple(linearisations), prior, pull)
 
     def rematched(self, unknowns: NDArray[np.float64]) -> Objective:
         """The same with what belongs together in model and image chosen anew at unknowns (n_unknowns,).
@@ -298,7 +298,7 @@ class Objective:
         seen = self._residuals(s, solution.values, unknowns)
         numbers = {name: number for number, name in enumerate(self.parameters.offset_names(s))}
 
-        def line(of: tuple[slice, tuple[Observation, Residuals]]) -> Linearisation:
+        def linearised(of: tuple[slice, tuple[Observation, Residuals]]) -> Linearisation:
             """One observation's residuals with their derivative."""
             rows, (observation, residuals) = of
             direct = None if residuals.direct is None else (residuals.direct, self._by_material(s, unknowns))
@@ -307,7 +307,7 @@ class Objective:
             weights = _robust_weights(observation, residuals)
             return Linearisation.of(observation, s, residuals, columns, jacobian, weights)
 
-        return mapped(line, zip(state.slices, seen, strict=True))
+        return mapped(linearised, zip(state.slices, seen, strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,8 +334,8 @@ class LinearisedObjective:
         step = unknowns - self.unknowns
 
         pairs = zip(self.objective.observations, self.evaluation.linearisations, strict=True)
-        lines = mapped(lambda pair: pair[1].moved(pair[0], step), pairs)
-        found = self.objective.assembled(unknowns, lines)
+        moved = mapped(lambda pair: pair[1].moved(pair[0], step), pairs)
+        found = self.objective.assembled(unknowns, moved)
         if not self.damping:
             return found
         ridge = self.damping * np.diag(self.evaluation.matrix)
@@ -369,11 +369,6 @@ def log_det(matrix: NDArray[np.float64]) -> float:
     """Ln det of a positive definite matrix (n, n), without the unknowns that nothing depends on."""
     seen = np.diag(matrix) > 0.0
     return float(np.linalg.slogdet(matrix[np.ix_(seen, seen)])[1]) if seen.any() else 0.0
-
-
-def _mean_loss(observation: Observation, residuals: Residuals) -> float:
-    """Weighted sum of rho(r), mm^2."""
-    return float(residuals.weights @ observation.weighting.loss.rho(residuals.values))
 
 
 def _prior(parameters: ParameterMap, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -244,7 +244,7 @@ def newton_decrement(now: Evaluation) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _QuadraticModel:
-    """An objective with the score s and the matrix H around a place, all but its free log-moduli eliminated.
+    """An objective with the score s and the matrix H around a point, all but its free log-moduli eliminated.
 
     free (n,): which unknowns move. Steps d of their log-moduli t and of the others q: H_qq d_q = -s_q - H_qt d_t, hence
     d_q = -rest - slopes d_t, rest (m,) and slopes (m, k). matrix (k, k): H_tt - H_tq slopes; score (k,): s_t -

@@ -48,7 +48,7 @@ class Criterion(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Convergence:
-    """What an iteration left open, each over its tolerance: converged where none exceeds 1."""
+    """What an iteration left unmet, each over its tolerance: converged where none exceeds 1."""
 
     step: float = np.inf
     linearisation: float = np.inf
@@ -185,7 +185,7 @@ def minimised(
     """Lower the objective from `start` until a stop rule is met.
 
     Where it is met the blocks choose their alternatives afresh, and the loop goes on from there; of the minima that it
-    finds so the likeliest is told. fixed: whether the log-moduli stay. `title` begins each line of `progress`. The
+    finds so the likeliest is returned. fixed: whether the log-moduli stay. `title` begins each line of `progress`. The
     minimum's history is that of the loop alone, its evaluations are added to those of `start`. Raises `NotConverged`
     when the full model has no equilibrium where every trial leads.
     """
@@ -196,9 +196,9 @@ def minimised(
     del start
     region, ends, last = TrustRegion(), list[OuterIterate](), 0
     for number in range(1, rule.iterations + 1):
-        line, early = f"{title}, iteration {number}", 2 * number <= rule.iterations
+        heading, early = f"{title}, iteration {number}", 2 * number <= rule.iterations
         lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
-        progress(f"{line}: {now.objective.parameters.in_words(now.minimum.unknowns)}{lowered}")
+        progress(f"{heading}: {now.objective.parameters.in_words(now.minimum.unknowns)}{lowered}")
         now, region = _iteration(now, bounds, rule, region, fixed, grows=early)
         if now.minimum.outcome is Outcome.STUCK:
             break
@@ -319,20 +319,20 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     """
     objective, at, n = start.objective, start.minimum, start.objective.n_parameters
     trusted = [state.approximation.trust_radius for state in objective.states if state.approximation]
-    theta, reach = at.unknowns[:n], min([region.radius, *trusted])
-    near = Bounds(np.maximum(bounds.lower, theta - reach), np.minimum(bounds.upper, theta + reach))
+    theta, radius = at.unknowns[:n], min([region.radius, *trusted])
+    near = Bounds(np.maximum(bounds.lower, theta - radius), np.minimum(bounds.upper, theta + radius))
     damping, within = region.damping, 0.05 * rule.tolerance(at, n)
 
     def least(linear: LinearisedObjective, begin: NDArray[np.float64]) -> tuple[Minimum, bool]:
-        """Its minimum, or how far on the straight way there what else acts on moduli may go; whether that is it."""
+        """Its minimum, or how far on the way there what else acts on moduli may go; whether that is it."""
         found = gauss_newton(linear, begin, bounds=near, fixed=fixed, tolerance=INNER, within=within)
         whole = found.unknowns - at.unknowns
         furthest = float(np.max(np.abs(whole[objective.parameters.acting_on_moduli]), initial=0.0))
-        if furthest <= reach and not linear.damping:
+        if furthest <= radius and not linear.damping:
             return found, False
-        unknowns = at.unknowns + reach / furthest * whole if furthest > reach else found.unknowns
+        unknowns = at.unknowns + radius / furthest * whole if furthest > radius else found.unknowns
         there = replace(found, unknowns=unknowns, evaluation=replace(linear, damping=0.0)(unknowns))
-        return there, furthest > reach
+        return there, furthest > radius
 
     found, shortened = least(LinearisedObjective(objective, at.unknowns, at.evaluation, damping), at.unknowns)
     theta = found.unknowns[:n]
@@ -389,9 +389,9 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
         _, off, cost = model_error(objective, minimum)
         checks, missing = checks + cost, float(np.max(off / (rule.model_error * tolerance), initial=0.0))
     if missing >= 1.0:
-        places = objective.linearisation_points(unknowns, minimum.evaluation)
-        pairs = zip(objective.approximations, places, strict=True)
-        objective = objective.under([approximation.update(place) for approximation, place in pairs])
+        points = objective.linearisation_points(unknowns, minimum.evaluation)
+        pairs = zip(objective.approximations, points, strict=True)
+        objective = objective.under([approximation.update(point) for approximation, point in pairs])
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
         steps, across = step.remaining(before.unknowns, minimum.evaluation, bounds, fixed)
         if across:  # by a model that is exact there
@@ -403,7 +403,7 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
 def linearisation_distance(objective: Objective, unknowns: NDArray[np.float64]) -> float:
     """The largest distance d of ln E at unknowns (n_unknowns,) from where an approximation's derivatives are exact.
 
-    There they are off by a share d, and so is what the residuals pull with them, which is worth a posterior standard
+    There they are off by a share d, and so is what the residuals pull with them, which is one posterior standard
     deviation: an estimate is set off by d of them. Infinite where they are exact nowhere yet.
     """
     moduli, distance = objective.parameters.moduli(unknowns), 0.0
@@ -427,9 +427,9 @@ def model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray[
     if not np.isfinite(largest):
         return np.inf, np.full(objective.n_parameters, np.inf), cost
     pull = np.zeros(len(minimum.unknowns))
-    for line in minimum.evaluation.linearisations:
-        du = seen_by(line.observation, errors[line.state].missing)
-        missing = np.asarray(line.residuals.jacobian @ du)
-        pull[line.columns] += line.jacobian.transposed_times(line.precision * line.weights * missing)
+    for term in minimum.evaluation.linearisations:
+        du = seen_by(term.observation, errors[term.state].missing)
+        missing = np.asarray(term.residuals.jacobian @ du)
+        pull[term.columns] += term.jacobian.transposed_times(term.precision * term.weights * missing)
     off = np.abs(minimum.evaluation.covariance_columns(objective.n_parameters).T @ pull)
     return largest, np.asarray(off), cost

@@ -16,14 +16,14 @@ from palpate.mechanics.forward import DenseEquilibrium, Equilibrium, ForwardMode
 class CurvedModel:
     """u(E, q) = u_1(E, q) + w(E, q) - w_1(E, q); implements `ForwardModel`.
 
-    u_1: `expansion`; w: the `like` model, of the same outputs; w_1: its expansion at the same place (`straight`). There
+    u_1: `expansion`; w: the `like` model, of the same outputs; w_1: its expansion at the same place (`linear`). There
     value and first derivatives are those of u_1. The second ones are those of w: that an organ matters the less the
     stiffer it is, both laws have in common.
     """
 
     expansion: FirstOrderModel
     like: ForwardModel
-    straight: FirstOrderModel
+    linear: FirstOrderModel
 
     @classmethod
     def of(cls, expansion: FirstOrderModel, like: ForwardModel) -> Self:
@@ -45,8 +45,8 @@ class CurvedModel:
     def solve(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> CurvedEquilibrium:
         """The displacement at moduli (n_regions,) kPa and mode coefficients (n_modes,); raises `SolverError`."""
         bent = self.like.solve(moduli, coefficients)
-        first, straight = self.expansion.solve(moduli, coefficients), self.straight.solve(moduli, coefficients)
-        return CurvedEquilibrium(self, bent, first.values + bent.values - straight.values)
+        first, linear = self.expansion.solve(moduli, coefficients), self.linear.solve(moduli, coefficients)
+        return CurvedEquilibrium(self, bent, first.values + bent.values - linear.values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +59,9 @@ class CurvedEquilibrium(DenseEquilibrium):
 
     def tangent(self) -> NDArray[np.float64]:
         """T (n_outputs, n_regions + n_modes), mm: columns du / d ln E_r, then du / dq_k."""
-        return np.asarray(self.bent.tangent() + (self.model.expansion.derivatives - self.model.straight.derivatives))
+        return np.asarray(self.bent.tangent() + (self.model.expansion.derivatives - self.model.linear.derivatives))
 
     def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
         """T^T g (n_regions + n_modes,) for g (n_outputs,)."""
-        rest = self.model.expansion.derivatives - self.model.straight.derivatives
+        rest = self.model.expansion.derivatives - self.model.linear.derivatives
         return np.asarray(self.bent.adjoint(gradient) + rest.T @ gradient)

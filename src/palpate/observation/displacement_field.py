@@ -98,12 +98,12 @@ def read_displacement_field(file: DataFile) -> DisplacementField:
         raise InputDataError(f"'{path}' cannot be read: {error}; check the path") from error
     vectors, affine = reader(path)
     flat = vectors.reshape(-1, 3) * (LPS_TO_RAS if file.axes == "LPS" else np.ones(3))
-    told = np.isfinite(flat).all(axis=1) & flat.any(axis=1)
-    if not told.any():
+    given = np.isfinite(flat).all(axis=1) & flat.any(axis=1)
+    if not given.any():
         raise InputDataError(f"'{path}' holds no vector but zeros; give a field that moves something")
-    index = np.stack(np.unravel_index(np.flatnonzero(told), vectors.shape[:3]), axis=1).astype(np.float64)
+    index = np.stack(np.unravel_index(np.flatnonzero(given), vectors.shape[:3]), axis=1).astype(np.float64)
     before = index @ affine[:3, :3].T + affine[:3, 3]
-    table = PointTable(before, before + flat[told], ("",) * len(before), (digest,))
+    table = PointTable(before, before + flat[given], ("",) * len(before), (digest,))
     return DisplacementField(file, table)
 
 

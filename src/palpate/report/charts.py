@@ -66,7 +66,7 @@ def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name
 def forces_svg(data: ReportData, *, name: str) -> str:
     """Each measured force (N) with its 95 % interval as a bar, the fitted one as a dot, one below the other, as SVG."""
     forces = data.document["forces"]
-    told = [
+    parts = [
         f"{force['name']} measured {force['measured_n']:.4g} N, fitted {force['fitted_n']:.4g} N" for force in forces
     ]
     several = len({force["after"] for force in forces}) > 1
@@ -86,7 +86,7 @@ def forces_svg(data: ReportData, *, name: str) -> str:
         axes.xaxis.set_major_locator(MaxNLocator(5))
 
     size = (SIZE[0], ROW_INCHES * len(forces) + 0.75)
-    return draw_svg(draw, size=size, name=name, says=f"Forces: {'; '.join(told)}.")
+    return draw_svg(draw, size=size, name=name, says=f"Forces: {'; '.join(parts)}.")
 
 
 def objective_svg(data: ReportData, *, name: str) -> str:
@@ -269,8 +269,8 @@ def repeats_svg(data: ReportData, estimate: int, *, name: str) -> str:
         axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
         _plain_numbers(axes.yaxis)
 
-    told = [f"{k} {number(value)}{' (an outlier)' if out else ''}" for k, (value, _, out) in enumerate(alone, start=1)]
-    says = f"{tissue} by each later image alone: {', '.join(told)}; all together {number(_value(item))}."
+    parts = [f"{k} {number(value)}{' (an outlier)' if out else ''}" for k, (value, _, out) in enumerate(alone, start=1)]
+    says = f"{tissue} by each later image alone: {', '.join(parts)}; all together {number(_value(item))}."
     return draw_svg(draw, size=SIZE, name=name, says=says)
 
 

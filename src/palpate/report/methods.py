@@ -118,8 +118,8 @@ def _model(data: ReportData, cite: Callable[[str], str]) -> str:
     sought = [row.tissue for row in ratio_rows(document)]
     given = [t for t in data.tissues if t.role in ("estimate", "known") and t.name not in sought]
     ratios = sorted({f"{t.poisson_ratio:g}" for t in given})
-    told = [f"Poisson's ratios of {listed(ratios)}"] if ratios else []
-    told += [f"Poisson's ratios of {listed(sought)} as unknowns beside the moduli"] if sought else []
+    constants = [f"Poisson's ratios of {listed(ratios)}"] if ratios else []
+    constants += [f"Poisson's ratios of {listed(sought)} as unknowns beside the moduli"] if sought else []
     priors = {key.removeprefix(MAP_OF): prior for key, prior in data.settings if key.startswith(MAP_OF)}
     fields = listed([f"{name} ({prior})" for name, prior in priors.items()])
     made = (
@@ -136,7 +136,7 @@ def _model(data: ReportData, cite: Callable[[str], str]) -> str:
     return (
         f"{made} The tissues followed"
         f" {law.description if law else 'the law ' + document['law']} in"
-        f" {ELEMENTS.get(document['element'], str(document['element']))}, with {listed(told)};"
+        f" {ELEMENTS.get(document['element'], str(document['element']))}, with {listed(constants)};"
         " each was one solid, so that the modulus of an organ with a wall around a fluid, as a bladder, is an effective"
         f" one, not its wall's. The outer boundary: {settings['outer boundary']}. The motion of the drivers' walls was"
         f" a Gaussian process in its leading modes ({settings['driver motion']}) {kernel}, estimated together"

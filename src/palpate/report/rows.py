@@ -146,7 +146,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
         value, interval = main_numbers(item)
         truth, shares = item["truth"], item.get("variance_shares") or {}
         sources = document.get("information_shares", {}).get(item["tissue"], {}) if document["case"].get("data") else {}
-        told = sorted(sources.items(), key=lambda source: -source[1])
+        largest = sorted(sources.items(), key=lambda source: -source[1])
         row = EstimateRow(
             tissue=item["tissue"],
             colour=colours.get(item["tissue"], "#888888"),
@@ -164,7 +164,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             expected=expected_share(value, interval, truth) if shown and value and truth else NONE,
             bar=_bar(value, interval, truth=truth, scale=scale) if scale and value and interval else None,
             shares=_shares({CAUSES.get(cause, cause): share for cause, share in shares.items()}) if shown else (),
-            sources=_shares({BELIEVED if kind == "prior" else kind: share for kind, share in told}) if shown else (),
+            sources=_shares({BELIEVED if kind == "prior" else kind: share for kind, share in largest}) if shown else (),
         )
         rows.append(row)
     return tuple(rows)

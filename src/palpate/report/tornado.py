@@ -146,8 +146,8 @@ def tornado_svg(document: Mapping[str, Any], tissue: str, *, name: str) -> str:
         axes.set_xlabel("modulus, times the estimate")
         axes.grid(visible=True, axis="x")
 
-    told = "; ".join(f"{row.label}: {effect_text(row)}" for row in rows)
-    return draw_svg(draw, size=(7.2, height), name=name, says=f"Tornado of {tissue}: {told}.")
+    listing = "; ".join(f"{row.label}: {effect_text(row)}" for row in rows)
+    return draw_svg(draw, size=(7.2, height), name=name, says=f"Tornado of {tissue}: {listing}.")
 
 
 def sensitivity_page(document: Mapping[str, Any]) -> str:

@@ -58,9 +58,9 @@ def information_shares(evaluation: Evaluation, n_parameters: int) -> list[dict[s
     found = []
     for h in evaluation.covariance_columns(n_parameters).T:
         parts = {"prior": float(h @ evaluation.prior @ h)}
-        for line in evaluation.linearisations:
-            known = float(line.precision * line.weights @ line.jacobian.times(h[line.columns]) ** 2)
-            parts[line.observation.kind] = parts.get(line.observation.kind, 0.0) + known
+        for term in evaluation.linearisations:
+            known = float(term.precision * term.weights @ term.jacobian.times(h[term.columns]) ** 2)
+            parts[term.observation.kind] = parts.get(term.observation.kind, 0.0) + known
         found.append({kind: part / sum(parts.values()) for kind, part in parts.items()})
     return found
 

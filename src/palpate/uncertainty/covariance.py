@@ -13,7 +13,7 @@ from scipy import sparse
 from palpate.images.distance import cropped, window_of
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
-from palpate.inversion.hyper_parameters import of_one_noise, undecided_covariance
+from palpate.inversion.hyper_parameters import of_one_noise
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
@@ -21,6 +21,7 @@ from palpate.observation.contract import Imaged
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, mean_noise
 from palpate.parallel import mapped
+from palpate.uncertainty.alternatives import undecided_covariance
 from palpate.uncertainty.intervals import discretisation_sd
 
 GridErrors = Sequence[Sequence[NDArray[np.float64]]]
@@ -173,18 +174,18 @@ def _given_model(objective: Objective, evaluation: Evaluation) -> Evaluation:
     own = np.concatenate([np.arange(parameters.n_parameters), *kept])
     if len(own) == parameters.n_unknowns:
         return evaluation
-    lines = []
-    for line in evaluation.linearisations:
-        inside = np.isin(line.columns, own)
-        columns, jacobian = np.searchsorted(own, line.columns[inside]), line.jacobian.of_columns(inside)
-        score, information = line.score[inside], line.information[np.ix_(inside, inside)]
-        lines.append(replace(line, columns=columns, jacobian=jacobian, score=score, information=information))
+    linearisations = []
+    for term in evaluation.linearisations:
+        inside = np.isin(term.columns, own)
+        columns, jacobian = np.searchsorted(own, term.columns[inside]), term.jacobian.of_columns(inside)
+        score, information = term.score[inside], term.information[np.ix_(inside, inside)]
+        linearisations.append(replace(term, columns=columns, jacobian=jacobian, score=score, information=information))
     within = np.ix_(own, own)
     return replace(
         evaluation,
         score=evaluation.score[own],
         matrix=evaluation.matrix[within],
-        linearisations=tuple(lines),
+        linearisations=tuple(linearisations),
         prior=evaluation.prior[within],
         prior_score=evaluation.prior_score[own],
     )
@@ -256,15 +257,15 @@ def noise_covariance(
     """
     n = len(pairs[0][1])
     data = np.zeros((n, n))
-    for kind in dict.fromkeys(line.observation.kind for line, _ in pairs):
-        of_kind = [(line, row) for line, row in pairs if line.observation.kind == kind]
-        later = [line.state for line, _ in of_kind]
+    for kind in dict.fromkeys(term.observation.kind for term, _ in pairs):
+        of_kind = [(term, row) for term, row in pairs if term.observation.kind == kind]
+        later = [term.state for term, _ in of_kind]
         for groups, at_rest in ((later, False), ([objective.states[s].reference for s in later], True)):
             for key in dict.fromkeys(groups):
                 group = [pair for pair, own in zip(of_kind, groups, strict=True) if own == key]
-                noise = mean_noise([noise_of[line.state, kind] for line, _ in group])
+                noise = mean_noise([noise_of[term.state, kind] for term, _ in group])
                 carried = np.concatenate([row for _, row in group], axis=1)
-                residuals = [line.residuals for line, _ in group]
+                residuals = [term.residuals for term, _ in group]
                 places = np.concatenate([r.material if at_rest else r.places for r in residuals])
                 data += 0.5 * noise.covariance(carried, places, np.concatenate([r.normals for r in residuals]))
     return data
@@ -276,25 +277,27 @@ def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
     The residuals at a minimum are what the fit left of them: see `FitResponse`. What errors of one later image do to
     the residuals of another, by the moduli alone, is neglected.
     """
-    lines, n, found = evaluation.linearisations, len(evaluation.matrix), {}
+    linearisations, n, found = evaluation.linearisations, len(evaluation.matrix), {}
     inverse = evaluation.covariance_columns(n)
     for key, (own, telling) in of_one_noise(evaluation).items():
         jacobians, gains = list[Jacobian](), list[Jacobian]()
-        for line in (lines[i] for i in telling):
-            tangent = np.zeros((len(line.jacobian.tangent), n))
-            tangent[:, line.columns] = line.jacobian.tangent
-            jacobians.append(replace(line.jacobian, tangent=tangent))
-        for line in (lines[i] for i in own):  # W J H^-1, its part of the gain's transpose
-            weights = sparse.diags_array(line.precision * line.weights)
-            seen = sparse.csr_matrix(weights @ line.jacobian.by_displacement)
-            gains.append(Jacobian(seen, line.jacobian.tangent @ inverse[line.columns]))
+        for term in (linearisations[i] for i in telling):
+            tangent = np.zeros((len(term.jacobian.tangent), n))
+            tangent[:, term.columns] = term.jacobian.tangent
+            jacobians.append(replace(term.jacobian, tangent=tangent))
+        for term in (linearisations[i] for i in own):  # W J H^-1, its part of the gain's transpose
+            weights = sparse.diags_array(term.precision * term.weights)
+            seen = sparse.csr_matrix(weights @ term.jacobian.by_displacement)
+            gains.append(Jacobian(seen, term.jacobian.tangent @ inverse[term.columns]))
         response = FitResponse(
             jacobians,
             gains,
-            places=[lines[i].residuals.material for i in own],
-            normals=[lines[i].residuals.normals for i in own],
+            places=[linearisations[i].residuals.material for i in own],
+            normals=[linearisations[i].residuals.normals for i in own],
         )
-        found[key] = lines[own[0]].observation.fitted_noise([lines[i].residuals for i in telling], response)
+        found[key] = linearisations[own[0]].observation.fitted_noise(
+            [linearisations[i].residuals for i in telling], response
+        )
     return found
 
 
@@ -347,7 +350,7 @@ def grid_covariance(
     is the less only where it is no kernel's: then the positive part of the difference, with which the noise is at least
     as large as each of the two in every direction.
     """
-    seen = [line.observation for line in evaluation.linearisations]
+    seen = [term.observation for term in evaluation.linearisations]
     if any(isinstance(o, Imaged) and o.stated_noise is not None for o in seen):
         return grid
     return _positive_part(grid - noise)
@@ -382,23 +385,23 @@ def imaging_errors(
     errors, rest = list[NDArray[np.float64]](), dict[int, Segmentation]()
     references = [state.reference for state in objective.states]
     for s, (reference, fitted) in enumerate(zip(references, states, strict=True)):
-        lines: list[Linearisation] = [line for line in evaluation.linearisations if line.state == s]
-        if not any(isinstance(line.observation, Imaged) for line in lines):
-            errors += [np.zeros(len(line.weights)) for line in lines]
+        linearisations: list[Linearisation] = [term for term in evaluation.linearisations if term.state == s]
+        if not any(isinstance(term.observation, Imaged) for term in linearisations):
+            errors += [np.zeros(len(term.weights)) for term in linearisations]
             continue
         if reference not in rest:
             material = [
-                line.residuals.material for line in evaluation.linearisations if references[line.state] == reference
+                term.residuals.material for term in evaluation.linearisations if references[term.state] == reference
             ]
             rest[reference] = _imaged(
                 fitted.space, np.zeros_like(fitted.displacement), fitted.before, material, margin_mm, rng
             )
-        places = [line.residuals.places for line in lines]
+        places = [term.residuals.places for term in linearisations]
         after = _imaged(fitted.space, fitted.displacement, fitted.after, places, margin_mm, rng)
-        for line in lines:
-            seen, error = line.observation, np.zeros(len(line.weights))  # none of what no segmented image shows
+        for term in linearisations:
+            seen, error = term.observation, np.zeros(len(term.weights))  # none of what no segmented image shows
             if isinstance(seen, Imaged):
-                error = seen.imaging_error(line.residuals, rest[reference], after)
+                error = seen.imaging_error(term.residuals, rest[reference], after)
             errors.append(error)
     return errors
 

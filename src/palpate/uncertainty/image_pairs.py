@@ -121,10 +121,10 @@ def _each_alone(objective: Objective, minimum: Minimum, bounds: Bounds) -> list[
     found = list[Minimum]()
     for s, state in enumerate(objective.states):
         parameters, own = objective.parameters.alone(s)
-        seen = [line for line in minimum.evaluation.linearisations if line.state == s]
-        lines = tuple(replace(line, state=0, columns=np.searchsorted(own, line.columns)) for line in seen)
+        seen = [term for term in minimum.evaluation.linearisations if term.state == s]
+        linearisations = tuple(replace(term, state=0, columns=np.searchsorted(own, term.columns)) for term in seen)
         start = minimum.unknowns[own]
-        evaluation = replace(minimum.evaluation, linearisations=lines)
+        evaluation = replace(minimum.evaluation, linearisations=linearisations)
         fixed = fixed_correspondence(Objective((state,), parameters), start, evaluation)
         found.append(gauss_newton(fixed, start, bounds=bounds, tolerance=1e-4))
     return found
@@ -144,10 +144,10 @@ def _noise_and_prior(objective: Objective, alone: Sequence[Minimum]) -> tuple[ND
         columns = slice(s * n, (s + 1) * n)
         answers[mapping.alone(s)[1], columns] = evaluation.covariance_columns(n)
         noise |= {(s, kind): model for (_, kind), model in error_noise(evaluation).items()}
-        for line, rows in zip(evaluation.linearisations, gain(evaluation, n), strict=True):
+        for term, rows in zip(evaluation.linearisations, gain(evaluation, n), strict=True):
             placed = np.zeros((size, rows.shape[1]))
             placed[columns] = rows
-            pairs.append((replace(line, state=s), placed))
+            pairs.append((replace(term, state=s), placed))
     return noise_covariance(objective, pairs, noise), np.asarray(answers.T @ mapping.prior_matrix @ answers)
 
 

@@ -65,9 +65,9 @@ def posterior_chains(
     log-moduli that go with it lie on a curve in x, and nearly on a line in y.
     """
     n, parameters = frozen.objective.n_parameters, frozen.objective.parameters
-    straight = _Straight(frozen, parameters.acting_on_moduli, parameters.shares_on_moduli)
-    slopes, start = straight.slopes(start), start.copy()
-    start[straight.columns] = in_series(start[straight.columns], straight.shares)
+    coordinates = _SeriesCoordinates(frozen, parameters.acting_on_moduli, parameters.shares_on_moduli)
+    slopes, start = coordinates.slopes(start), start.copy()
+    start[coordinates.columns] = in_series(start[coordinates.columns], coordinates.shares)
     try:
         laplace = _Laplace(start, linalg.cholesky(evaluation.matrix / np.outer(slopes, slopes), lower=True))
     except linalg.LinAlgError as error:
@@ -84,13 +84,13 @@ def posterior_chains(
         now = start + SPREAD * laplace.draws(1, generator)[0]
         inside = np.clip(start[:n] + stretch @ (now[:n] - start[:n]), bounds.lower, bounds.upper)
         now[:n] = start[:n] + SHRUNK * np.linalg.solve(stretch, inside - start[:n])
-        while not np.isfinite(straight.energy(now)[0]):  # stiffer than any share makes it: no proposal leads out
+        while not np.isfinite(coordinates.energy(now)[0]):  # stiffer than any share makes it: no proposal leads out
             now = 0.5 * (start + now)
         parts, accepted = [], 0
         for done in range(0, warm + steps, BLOCK):
             several = min(BLOCK, warm + steps - done)
             *part, now, taken = _chain(
-                straight, laplace, now, bounds=bounds, steps=several, rng=generator, stretch=stretch
+                coordinates, laplace, now, bounds=bounds, steps=several, rng=generator, stretch=stretch
             )
             parts.append(part)
             accepted += taken
@@ -101,7 +101,7 @@ def posterior_chains(
 
 
 @dataclass(frozen=True, slots=True)
-class _Straight:
+class _SeriesCoordinates:
     """A frozen posterior of the unknowns z, x but for y in place of those with numbers `columns` (n,)."""
 
     frozen: FrozenPosterior
@@ -114,10 +114,10 @@ class _Straight:
         found[self.columns] = in_series_slopes(unknowns[self.columns], self.shares)
         return found
 
-    def energy(self, straight: NDArray[np.float64]) -> tuple[float, float]:
+    def energy(self, places: NDArray[np.float64]) -> tuple[float, float]:
         """Minus the log-density at z (n_unknowns,), of z and of x; infinite where there is no x."""
-        unknowns = straight.copy()
-        unknowns[self.columns] = of_series(straight[self.columns], self.shares)
+        unknowns = places.copy()
+        unknowns[self.columns] = of_series(places[self.columns], self.shares)
         if not np.isfinite(unknowns).all():
             return np.inf, np.inf
         value = self.frozen.value(unknowns)
@@ -143,7 +143,7 @@ class _Laplace:
 
 
 def _chain(
-    straight: _Straight,
+    coordinates: _SeriesCoordinates,
     laplace: _Laplace,
     start: NDArray[np.float64],
     *,
@@ -160,14 +160,14 @@ def _chain(
     centre = laplace.centre[: len(stretch)]
     n = len(centre)
     theta, energy, accepted = np.empty((steps, n)), np.empty(steps), 0
-    now, (own, value) = start, straight.energy(start)
+    now, (own, value) = start, coordinates.energy(start)
     level = own - laplace.energy(start)
     draws, thresholds = laplace.draws(steps, rng), np.log(rng.random(steps))
     for k in range(steps):
         trial = laplace.centre + np.sqrt(1.0 - STEP**2) * (now - laplace.centre) + STEP * draws[k]
         stretched = centre + stretch @ (trial[:n] - centre)
         if np.all((stretched >= bounds.lower) & (stretched <= bounds.upper)):
-            own, there = straight.energy(trial)
+            own, there = coordinates.energy(trial)
             above = own - laplace.energy(trial)
             if thresholds[k] < level - above:
                 now, value, level, accepted = trial, there, above, accepted + 1

@@ -87,10 +87,10 @@ class FastPath:
         if dropped is not None:
             precision, start[n:] = precision + DROPPED * np.diag(dropped), np.where(dropped, 0.0, start[n:])
         objective = replace(fixed.objective, parameters=replace(parameters, nuisance_precision=precision))
-        lines, there = fixed.lines, self.least.evaluation.linearisations
+        linearisations, there = fixed.linearisations, self.least.evaluation.linearisations
         if errors:
-            lines, there = _moved(lines, errors), _moved(there, errors)
-        changed = replace(fixed, objective=objective, lines=lines)
+            linearisations, there = _moved(linearisations, errors), _moved(there, errors)
+        changed = replace(fixed, objective=objective, linearisations=linearisations)
         begin = changed.assembled(start, there) if dropped is None else None
         return self._shift(
             gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE, max_steps=STEPS, begin=begin)
@@ -101,9 +101,9 @@ class FastPath:
         return Shift(theta - least, self.bounds.reached(theta), found.converged)
 
 
-def _moved(lines: Sequence[Linearisation], errors: Errors) -> tuple[Linearisation, ...]:
+def _moved(linearisations: Sequence[Linearisation], errors: Errors) -> tuple[Linearisation, ...]:
     """Linearisations with their residuals changed."""
-    return tuple(line.with_errors(error) for line, error in zip(lines, errors, strict=True))
+    return tuple(term.with_errors(error) for term, error in zip(linearisations, errors, strict=True))
 
 
 def fast_path(objective: Objective, minimum: Minimum, bounds: Bounds) -> FastPath:
@@ -141,8 +141,8 @@ def poisson_errors(
         for there in equilibria
     ]
     found = []
-    for line, moved in zip(evaluation.linearisations, _of_displacements(evaluation, tangents), strict=True):
-        seen, there = line.observation, equilibria[line.state]
+    for term, moved in zip(evaluation.linearisations, _of_displacements(evaluation, tangents), strict=True):
+        seen, there = term.observation, equilibria[term.state]
         if not isinstance(seen, OfMaterial):
             found.append(moved)
             continue
@@ -188,19 +188,19 @@ def law_errors(
 def _of_displacements(evaluation: Evaluation, changes: Sequence[NDArray[np.float64]]) -> Errors:
     """Changes of each observation's residuals, mm, by changes (n_dof, ...) mm of the states' displacements."""
     return tuple(
-        np.asarray(line.residuals.jacobian @ seen_by(line.observation, changes[line.state]))
-        for line in evaluation.linearisations
+        np.asarray(term.residuals.jacobian @ seen_by(term.observation, changes[term.state]))
+        for term in evaluation.linearisations
     )
 
 
 def modulus_errors(objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation) -> Errors:
     """Derivatives (n, n_regions) mm of each observation's residuals by ln E of the regions, known ones among them."""
-    found, lines = [], iter(evaluation.linearisations)
+    found, linearisations = [], iter(evaluation.linearisations)
     for state, place in zip(objective.states, objective.linearisation_points(unknowns), strict=True):
         assert state.observed is not None, "an objective is made of states with approximations"
         tangent = state.observed.solve(place.moduli, place.coefficients).tangent()[:, : len(place.moduli)]
         for rows in state.slices:
-            residuals = next(lines).residuals
+            residuals = next(linearisations).residuals
             by_moduli = np.asarray(residuals.jacobian @ tangent[rows])
             held = 0.0 if residuals.direct is None else residuals.direct[:, : len(place.moduli)]
             found.append(by_moduli + held)
@@ -214,10 +214,10 @@ def surface_errors(evaluation: Evaluation, tissue: str) -> Errors:
     the same growth in the first image, the mesh held, has the opposite effect: residuals are differences.
     """
     found = []
-    for line in evaluation.linearisations:
-        seen, peers = line.observation, [o.observation for o in evaluation.linearisations if o.state == line.state]
+    for term in evaluation.linearisations:
+        seen, peers = term.observation, [o.observation for o in evaluation.linearisations if o.state == term.state]
         if isinstance(seen, Imaged):
-            found.append(seen.growth_error(line.residuals, tissue, peers))
+            found.append(seen.growth_error(term.residuals, tissue, peers))
         else:
-            found.append(np.zeros_like(line.residuals.values))
+            found.append(np.zeros_like(term.residuals.values))
     return tuple(found)

@@ -59,8 +59,8 @@ def read_stl(path: Path, *, axes: str = "RAS") -> SurfaceFile:
             raise InputDataError(f"'{path}' is a damaged text ({error}); export it again") from error
     if not np.isfinite(corners).all() or np.abs(corners).max(initial=0.0) > MOST_MM:
         raise InputDataError(f"'{path}' has coordinates that are no number of millimetres; export it again")
-    told = re.search(rb"SPACE=(RAS|LPS)", content[:HEADING])
-    signs = LPS_TO_RAS if (told[1].decode() if told else axes) == "LPS" else np.ones(3)
+    stated = re.search(rb"SPACE=(RAS|LPS)", content[:HEADING])
+    signs = LPS_TO_RAS if (stated[1].decode() if stated else axes) == "LPS" else np.ones(3)
     points, numbers = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     triangles = numbers.reshape(-1, 3)
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]  # of two corners in one place
