@@ -18,7 +18,6 @@ from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import AS_GOOD, Objective
 from palpate.inversion.optimise import (
     Bounds,
-    Iterate,
     LeastSquares,
     Minimum,
     Outcome,
@@ -128,7 +127,7 @@ def continue_at_finite_strain(
             start = [_expanded(*_coarse(waiting.pop(number)), minimum, progress)]
             end = minimised(start.pop(), settings.bounds, rule, progress=progress, title="finite strain")
             progress("finite strain: the exact equilibrium at the estimate")
-            ends[number] = end = _at_equilibrium(end, minimum.history)
+            ends[number] = end = _at_equilibrium(end)
             spent, evaluations = spent + end.counts, evaluations + end.minimum.evaluations
         except EstimationError as error:
             if number == linear.best:
@@ -155,38 +154,35 @@ def with_released(
     if not fixed.minimum.converged or not released:
         return inversion
     unknowns, bounds = fixed.minimum.unknowns, settings.bounds
-    title = f"with {' and '.join(dict.fromkeys(block.cause for block in released))} free"
+    followed, title = inversion, f"with {' and '.join(dict.fromkeys(block.cause for block in released))} free"
     try:
         objective, evaluation = fixed.objective.released(fixed.minimum.evaluation, unknowns)
         points = objective.linearisation_points(unknowns, evaluation)
         near = [known.update(point) for known, point in zip(objective.approximations, points, strict=True)]
-        start = replace(begun(objective.under(near), unknowns), checks=fixed.checks)
+        start = replace(begun(objective.under(near), unknowns, history=fixed.minimum.history[:-1]), checks=fixed.checks)
         end = free = minimised(start, bounds, NEAR, progress=progress, title=title)
-        inversion = replace(_followed(inversion, fixed, free), released=free)
+        followed = _followed(inversion, fixed, free, free)
         gain = fixed.objective.total(fixed.minimum.evaluation) - total_counted_as(free, fixed)
         gain += min(block.released_odds for block in released)
         if free.minimum.converged and gain > AS_GOOD:
-            start = replace(free, minimum=replace(free.minimum, evaluations=0))
-            end = minimised(start, bounds, rule, progress=progress, title=title)
-            end = _at_equilibrium(end, ()) if inversion.objective.states[0].finite_strain else end
-            inversion = _followed(inversion, free, end)
+            end = minimised(free, bounds, rule, progress=progress, title=title)
+            end = _at_equilibrium(end) if inversion.objective.states[0].finite_strain else end
+            followed = _followed(inversion, fixed, free, end)
     except EstimationError as error:
-        return replace(inversion, unsettled=str(error))
+        return replace(followed, unsettled=str(error))
     if not end.minimum.converged:
-        return replace(inversion, unsettled=end.minimum.outcome.value)
+        return replace(followed, unsettled=end.minimum.outcome.value)
     if end is free:
-        return inversion
-    history = (*fixed.minimum.history, *free.minimum.history[1:], *end.minimum.history[1:])
-    end = replace(end, minimum=replace(end.minimum, history=history))
+        return followed
     candidates = list(inversion.candidates)
     candidates[inversion.best] = replace(best, iterate=end, value=best.value - gain)
-    return replace(inversion, candidates=tuple(candidates), released=None)
+    return replace(followed, candidates=tuple(candidates), released=None)
 
 
-def _followed(inversion: Inversion, before: OuterIterate, after: OuterIterate) -> Inversion:
-    """The inversion with what it cost to follow a minimum on from `before`."""
-    evaluations = inversion.evaluations + after.minimum.evaluations
-    return replace(inversion, evaluations=evaluations, counts=inversion.counts + (after.counts - before.counts))
+def _followed(inversion: Inversion, fixed: OuterIterate, free: OuterIterate, end: OuterIterate) -> Inversion:
+    """The inversion with its best minimum `free`, and with what it cost to follow this from `fixed` to `end`."""
+    spent, evaluations = end.counts - fixed.counts, inversion.evaluations + end.minimum.evaluations
+    return replace(inversion, evaluations=evaluations, counts=inversion.counts + spent, released=free)
 
 
 def _with_reduced_bases(
@@ -224,30 +220,22 @@ def _linear(
     first = minimised(begun(objective, begin), bounds, NEAR, progress=progress, title="the middle start")
     screened = _screened(first, settings, progress)
     groups = grouped(screened, n)
-    ends, spent = [first], first.minimum.evaluations
+    ends = [first]
     belongs = {groups[i]: 0 for i, m in enumerate(screened) if same_minimum(m.unknowns, first.minimum, n)}
     others = [min(members(groups, g), key=lambda i: screened[i].evaluation.value) for g in dict.fromkeys(groups)]
     others = sorted((i for i in others if groups[i] not in belongs), key=lambda i: screened[i].evaluation.value)
     for number in [i for i in others if screened[i].converged][:FOLLOWED]:
-        start = begun(first.objective, screened[number].unknowns)
-        end = minimised(start, bounds, COMPARED, progress=progress, title=f"start {number + 1}")
-        belongs[groups[number]], spent = len(ends), spent + end.minimum.evaluations
-        ends.append(end)
+        start, belongs[groups[number]] = begun(first.objective, screened[number].unknowns), len(ends)
+        ends.append(minimised(start, bounds, COMPARED, progress=progress, title=f"start {number + 1}"))
     same = grouped([end.minimum for end in ends], n)
     fewest = with_fewest(ends)
     totals = [total_counted_as(end, fewest) if end.minimum.converged else np.inf for end in ends]
     best = [min(members(same, g), key=lambda i: totals[i]) for g in range(max(same) + 1)]
     order = sorted(best, key=lambda i: totals[i])
-    followed = list[OuterIterate]()
     for number in order:
-        if rule is None or (followed and not as_good(totals[number], totals[order[0]])):
-            followed.append(ends[number])
-            continue
-        start = replace(ends[number], minimum=replace(ends[number].minimum, evaluations=0))
-        end = minimised(start, bounds, rule, progress=progress, title="linear law")
-        spent += end.minimum.evaluations
-        history = ends[number].minimum.history + end.minimum.history[1:]
-        followed.append(replace(end, minimum=replace(end.minimum, history=history)))
+        if rule is not None and (number == order[0] or as_good(totals[number], totals[order[0]])):
+            ends[number] = minimised(ends[number], bounds, rule, progress=progress, title="linear law")
+    followed = [ends[number] for number in order]
     rank = {number: order.index(best[same[number]]) for number in range(len(ends))}
     starts = tuple(
         StartRun(theta, minimum, rank[belongs[group]] if group in belongs else None)
@@ -256,7 +244,7 @@ def _linear(
     found = concluded(followed, starts, rest, bounds, 0)
     of_first = followed[0].counts
     counts = sum((other.counts - of_first for other in followed[1:]), of_first)
-    evaluations += 1 + spent + found.evaluations
+    evaluations += 1 + sum(end.minimum.evaluations for end in ends) + found.evaluations
     return replace(found, evaluations=evaluations, counts=counts)
 
 
@@ -297,13 +285,11 @@ def _expanded(
 ) -> OuterIterate:
     """A linear minimum on expansions around the equilibria there."""
     first = [expansion_around(equilibrium, tolerance=EQUILIBRIUM, progress=progress) for equilibrium in coarse]
-    objective = objective.under(first).rematched(minimum.unknowns)
-    now = replace(minimum, evaluation=objective(minimum.unknowns), evaluations=1)
-    return OuterIterate(objective, now)
+    return begun(objective.under(first), minimum.unknowns, history=minimum.history)
 
 
-def _at_equilibrium(end: OuterIterate, before: tuple[Iterate, ...]) -> OuterIterate:
-    """The end of an outer loop at exact equilibria; `before`: the way to where it began."""
+def _at_equilibrium(end: OuterIterate) -> OuterIterate:
+    """The end of an outer loop at exact equilibria."""
     exact = []
     points = end.objective.linearisation_points(end.minimum.unknowns)
     for approximation, point in zip(end.objective.approximations, points, strict=True):
@@ -311,5 +297,5 @@ def _at_equilibrium(end: OuterIterate, before: tuple[Iterate, ...]) -> OuterIter
         exact.append(approximation.at_equilibrium(point, tolerance=ACCURACY))
     final = end.objective.under(exact)
     evaluation, spent = final(end.minimum.unknowns), end.minimum.evaluations + 1
-    minimum = replace(end.minimum, evaluation=evaluation, evaluations=spent, history=before + end.minimum.history)
+    minimum = replace(end.minimum, evaluation=evaluation, evaluations=spent)
     return replace(end, objective=final, minimum=minimum)

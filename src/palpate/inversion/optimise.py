@@ -83,6 +83,11 @@ class Iterate:
     misfit_mm2: float
     decrement: float
 
+    @classmethod
+    def of(cls, unknowns: NDArray[np.float64], at: Evaluation, n_parameters: int) -> Iterate:
+        """That of unknowns (n_unknowns,) with their evaluation."""
+        return cls(unknowns[:n_parameters], at.value, at.misfit_mm2, newton_decrement(at))
+
 
 @dataclass(frozen=True, slots=True)
 class Minimum:

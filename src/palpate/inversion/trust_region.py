@@ -24,7 +24,6 @@ from palpate.inversion.optimise import (
     Outcome,
     TrustRegion,
     gauss_newton,
-    newton_decrement,
     newton_step,
     posterior_sd,
 )
@@ -118,10 +117,12 @@ class OuterIterate:
         return sum((approximation.counts for approximation in self.objective.approximations), self.checks)
 
 
-def begun(objective: Objective, unknowns: NDArray[np.float64]) -> OuterIterate:
-    """Where a loop begins: an objective matched, and evaluated, at unknowns (n_unknowns,)."""
+def begun(objective: Objective, unknowns: NDArray[np.float64], *, history: tuple[Iterate, ...] = ()) -> OuterIterate:
+    """Where a loop begins: an objective matched, and evaluated, at unknowns (n_unknowns,); `history`: the way there."""
     objective = objective.rematched(unknowns)
-    return OuterIterate(objective, Minimum(unknowns, objective(unknowns), Outcome.STEPS, (), 1))
+    evaluation = objective(unknowns)
+    history = (*history, Iterate.of(unknowns, evaluation, objective.n_parameters))
+    return OuterIterate(objective, Minimum(unknowns, evaluation, Outcome.STEPS, history, 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,14 +186,11 @@ def minimised(
     """Lower the objective from `start` until a stop rule is met.
 
     Where it is met the blocks choose their alternatives afresh, and the loop goes on from there; of the minima that it
-    finds so the likeliest is returned. fixed: whether the log-moduli stay. `title` begins each line of `progress`. The
-    minimum's history is that of the loop alone, its evaluations are added to those of `start`. Raises `NotConverged`
-    when the full model has no equilibrium where every trial leads.
+    finds so the likeliest is returned. fixed: whether the log-moduli stay. `title` begins each line of `progress`.
+    History and evaluations are added to those of `start`. Raises `NotConverged` when the full model has no equilibrium
+    where every trial leads.
     """
-    at, n = start.minimum.evaluation, start.objective.n_parameters
-    first = Iterate(start.minimum.unknowns[:n], at.value, at.misfit_mm2, newton_decrement(at))
-    begin = replace(start.minimum, history=(first,), outcome=Outcome.STEPS)
-    now = replace(start, minimum=begin, totals=(), correlated=0)
+    now = replace(start, minimum=replace(start.minimum, outcome=Outcome.STEPS), totals=(), correlated=0)
     del start
     region, ends, last = TrustRegion(), list[OuterIterate](), 0
     for number in range(1, rule.iterations + 1):
@@ -251,8 +249,7 @@ def _iteration(
         if (gain + NOISE) / (promised + NOISE) > BAD and (first or not others or then - step.now <= AS_GOOD):
             region = region.after(gain / max(promised, 1e-9), longest, grows=grows)
             end, spent = there.minimum, before.evaluations + trial_evaluations
-            arrived = Iterate(end.unknowns[:n], seen.value, seen.misfit_mm2, newton_decrement(seen))
-            end = replace(end, history=(*before.history, arrived), evaluations=spent)
+            end = replace(end, history=(*before.history, Iterate.of(end.unknowns, seen, n)), evaluations=spent)
             totals = (*now.totals, (step.now, then))
             return replace(there, minimum=end, totals=totals), region
         if others:
