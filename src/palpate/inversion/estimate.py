@@ -160,8 +160,7 @@ def with_released(
         points = objective.linearisation_points(unknowns, evaluation)
         near = [known.update(point) for known, point in zip(objective.approximations, points, strict=True)]
         start = replace(begun(objective.under(near), unknowns, history=fixed.minimum.history[:-1]), checks=fixed.checks)
-        rough = replace(NEAR, derivatives=False)  # what it tells is J, and to a tenth of an interval where it lies
-        end = free = minimised(start, bounds, rough, progress=progress, title=title)
+        end = free = minimised(start, bounds, NEAR, progress=progress, title=title)
         followed = _followed(inversion, fixed, free, free)
         gain = fixed.objective.total(fixed.minimum.evaluation) - total_counted_as(free, fixed)
         gain += min(block.released_odds for block in released)
