@@ -99,6 +99,7 @@ class ReducedBasis:
             return conjugate_gradients(matrix, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)[0]
 
         new, directions = int(not at.same_as(self.place)), at.directions  # whether the displacement is sought, too
+        dual = int(directions is not None and at.gradient is not None)
         if directions is not None:
             directions = directions[: model.n_regions + model.constraint.n_modes]
         loads = -model.residual(at.moduli, displacement[:, None])[:, :new]
@@ -111,7 +112,7 @@ class ReducedBasis:
             loads = np.concatenate([loads, derivatives - times(matrix, known)], axis=1)
         if loads.shape[1]:
             missing = solved(loads, np.array([DISPLACEMENT] * new + [TANGENT] * (loads.shape[1] - new)))
-            cost = SolveCounts(forward=new, tangent=loads.shape[1] - new)
+            cost = SolveCounts(forward=new, adjoint=dual, tangent=loads.shape[1] - new - dual)
             late = np.asarray(model.constraint.free @ missing[:, :new])
             if directions is not None and np.linalg.norm(late) > FAR_OFF * np.linalg.norm(displacement):
                 by_modulus = np.where(np.arange(len(directions))[:, None] < model.n_regions, directions, 0.0)
