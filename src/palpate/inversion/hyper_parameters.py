@@ -197,7 +197,7 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     """
     parameters, n = objective.parameters, objective.n_parameters
     chosen = list(objective.chosen or (None,) * len(parameters.blocks))
-    rare = list(objective.rare or (0.0,) * len(parameters.blocks))
+    hyper_prior = list(objective.hyper_prior or (0.0,) * len(parameters.blocks))
     model, prior = normal_model(parameters, evaluation, unknowns), evaluation.prior.copy()
 
     def choice(i: int) -> tuple[float, int, Belief]:
@@ -223,9 +223,9 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
             i = max(waiting, key=lambda k: choices[k][0])
             waiting.remove(i)
             _, chosen[i], taken = choices[i]
-            rare[i], prior = taken.rare, model.believed(i, taken.covariance, prior)
+            hyper_prior[i], prior = taken.hyper_prior, model.believed(i, taken.covariance, prior)
     parameters = replace(parameters, nuisance_precision=prior[n:, n:])
-    return replace(objective, parameters=parameters, chosen=tuple(chosen), rare=tuple(rare))
+    return replace(objective, parameters=parameters, chosen=tuple(chosen), hyper_prior=tuple(hyper_prior))
 
 
 def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
@@ -273,7 +273,7 @@ class Belief(NamedTuple):
 
     evidence: float
     covariance: NDArray[np.float64]
-    rare: float
+    hyper_prior: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,7 +340,7 @@ def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: 
     floored = [term + floor * np.eye(len(term)) for term in terms]
     evidence, limits, (mean, sd) = seen.log_evidence(floored), np.log(block.amplitudes), block.log_amplitude
 
-    def rare(logs: NDArray[np.float64]) -> float:
+    def hyper_prior(logs: NDArray[np.float64]) -> float:
         """-ln p of ln of the amplitudes (n_terms,), up to a constant."""
         return 0.5 * float(np.sum(((logs - mean) / sd) ** 2))
 
@@ -348,10 +348,10 @@ def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: 
         """Minus the log-evidence and log prior at ln of the amplitudes (n_terms,), with its derivative."""
         squares = np.exp(2.0 * logs)
         value, slopes = evidence(squares)
-        return rare(logs) - value, (logs - mean) / sd**2 - 2.0 * squares * slopes
+        return hyper_prior(logs) - value, (logs - mean) / sd**2 - 2.0 * squares * slopes
 
     start, bounds = np.zeros(len(terms)).clip(*limits), [tuple(limits)] * len(terms)
     best = optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
     squares = np.exp(2.0 * best.x)
     covariance = sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))
-    return Belief(odds - float(best.fun), covariance, rare(best.x))
+    return Belief(odds - float(best.fun), covariance, hyper_prior(best.x))
