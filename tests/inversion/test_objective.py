@@ -71,18 +71,6 @@ def whole(line, unknowns):
     return jacobian
 
 
-def test_the_gradient_by_the_displacement_is_what_the_score_is_made_of(objective, rng):
-    """J^T W r = sum_s T_s^T g_s with the tangents T of all displacements, at each state's place."""
-    unknowns = rng.normal(scale=0.3, size=objective.parameters.n_unknowns)
-    evaluation = objective(unknowns)
-    found = np.zeros(len(unknowns))
-    for s, point in enumerate(objective.linearisation_points(unknowns, evaluation)):
-        tangent = objective.approximations[s].model.solve(point.moduli, point.coefficients).tangent()
-        own = objective.parameters.unknowns_of(s)
-        found[own] += objective.parameters.chain(s, unknowns).T @ (tangent.T @ point.gradient)
-    assert found == pytest.approx(evaluation.score - evaluation.prior_score, rel=1e-8, abs=1e-10)
-
-
 @pytest.mark.parametrize("loss", [PowerLaw(), PowerLaw(0.1)], ids=["squares", "robust"])
 def test_the_score_is_that_of_central_differences(twins, twin, point_motion, loss):
     """By points, whose Jacobian is exact; that of surfaces leaves out what slides over voxels."""

@@ -181,23 +181,6 @@ def test_an_updated_reduced_basis_misses_nothing_of_what_follows_the_material(bo
     assert np.linalg.norm(missing) < 0.05 * np.linalg.norm(before)
 
 
-@pytest.mark.parametrize("away", [0.8, 1.2])
-def test_an_update_makes_the_derivatives_by_the_material_exact_along_a_gradient(body, modes, coefficients, rng, away):
-    model, every = linear_model(*body, material=modes), np.concatenate(coefficients)
-    first = reduced_basis(model, MODULI)
-    first = first.with_material(first.system.material_responses(model.solve(MODULI, every).values), MODULI)
-    moduli, n = MODULI * [away, 1.0], model.n_regions + len(every)
-    there = LinearisationPoint(moduli, every, rng.normal(size=(n, 2)), np.eye(n))
-    homogeneous = np.concatenate([coefficients[0], 0.0 * coefficients[1]])
-    gradient = rng.normal(size=len(body[1].offset))
-    truth = model.solve(moduli, homogeneous).adjoint(gradient)
-    off = [
-        np.linalg.norm((of.model.solve(moduli, homogeneous).tangent().T @ gradient - truth)[model.n_regions :])
-        for of in (first.update(there), first.update(replace(there, gradient=gradient)))
-    ]
-    assert off[1] < 0.1 * off[0]
-
-
 def test_responses_to_the_material_are_made_anew_far_away_without_another_factorisation(body, modes, coefficients, rng):
     model, every = linear_model(*body, material=modes), np.concatenate(coefficients)
     first = reduced_basis(model, MODULI)

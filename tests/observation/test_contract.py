@@ -15,17 +15,7 @@ from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.mesh.locate import located
 from palpate.mesh.space import lagrange_space
-from palpate.observation.contract import (
-    DataFile,
-    Observation,
-    OfMaterial,
-    OfPoints,
-    Rematched,
-    Weighting,
-    n_seen,
-    seen_by,
-    seen_transposed,
-)
+from palpate.observation.contract import DataFile, Observation, OfMaterial, OfPoints, Rematched, Weighting, n_seen
 from palpate.observation.force import Force
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.observed_surface import ObservedSurface
@@ -199,13 +189,6 @@ def test_the_jacobian_and_its_transpose_are_adjoint(case, rng):
     found = case.residuals
     motion, pull = (rng.standard_normal(n) for n in found.jacobian.shape[::-1])
     assert (found.jacobian @ motion) @ pull == pytest.approx(motion @ (found.jacobian.T @ pull), rel=1e-10)
-
-
-def test_what_is_seen_and_its_transpose_are_adjoint(case, rng):
-    n_dof = int(case.seen.dofs.max()) + 4  # more than are seen
-    displacement, gradient = rng.standard_normal(n_dof), rng.standard_normal(n_seen(case.seen))
-    forwards = seen_by(case.seen, displacement) @ gradient
-    assert forwards == pytest.approx(displacement @ seen_transposed(case.seen, gradient, n_dof), rel=1e-10)
 
 
 def test_weights_sum_to_one_whatever_has_been_done(case):

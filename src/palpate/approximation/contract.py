@@ -46,15 +46,13 @@ class LinearisationPoint:
     """Moduli (n_regions,) kPa and driver coefficients (n_modes,) at which a model is approximated.
 
     directions (n_regions + n_modes, k) of (ln E, q): those along which derivatives are made exact, None where the
-    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there; gradient
-    (n_dof,) 1/mm: the misfit's by the displacement, whose derivatives by all of (ln E, q) are made exact.
+    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there.
     """
 
     moduli: NDArray[np.float64]
     coefficients: NDArray[np.float64]
     directions: NDArray[np.float64] | None = None
     metric: NDArray[np.float64] | None = None
-    gradient: NDArray[np.float64] | None = None
 
     def same_as(self, other: LinearisationPoint | None) -> bool:
         """Whether moduli and coefficients are those of another place."""

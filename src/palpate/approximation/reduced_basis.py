@@ -77,10 +77,7 @@ class ReducedBasis:
 
         Both are corrections by conjugate gradients with the factorisation that is there, from the reduced answers on;
         where it is none, or the moduli are far from its own, with a new one. The derivatives are those of the reduced
-        displacement, and of what it missed where that is no small share. The place's gradient g brings its dual
-        K^-1 g: derivatives of what Galerkin projects are off by their residuals, to which the basis is orthogonal, so
-        that along g, where their dual is in the basis, they are exact (Pierce & Giles 2000, SIAM Rev. 42, 247-264).
-        Raises `SolverError`.
+        displacement, and of what it missed where that is no small share. Raises `SolverError`.
         """
         model, near, sharper = self.full_model, self.system, self
         direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
@@ -99,31 +96,26 @@ class ReducedBasis:
             return conjugate_gradients(matrix, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)[0]
 
         new, directions = int(not at.same_as(self.place)), at.directions  # whether the displacement is sought, too
-        dual = int(directions is not None and at.gradient is not None)
         if directions is not None:
             directions = directions[: model.n_regions + model.constraint.n_modes]
         loads = -model.residual(at.moduli, displacement[:, None])[:, :new]
         if directions is not None:
             derivatives = model.boundary_loads(at.moduli, displacement, directions)
-            if at.gradient is not None:
-                derivatives = np.column_stack([derivatives, np.asarray(model.constraint.free.T @ at.gradient)])
             amplitudes = self.model.system(at.moduli).backward(self.projection.components(derivatives))
-            known = self.projection.spanned(amplitudes)
-            loads = np.concatenate([loads, derivatives - times(matrix, known)], axis=1)
+            loads = np.concatenate([loads, derivatives - matrix @ self.projection.spanned(amplitudes)], axis=1)
         if loads.shape[1]:
             missing = solved(loads, np.array([DISPLACEMENT] * new + [TANGENT] * (loads.shape[1] - new)))
-            cost = SolveCounts(forward=new, adjoint=dual, tangent=loads.shape[1] - new - dual)
+            cost = SolveCounts(forward=new, tangent=loads.shape[1] - new)
             late = np.asarray(model.constraint.free @ missing[:, :new])
             if directions is not None and np.linalg.norm(late) > FAR_OFF * np.linalg.norm(displacement):
                 by_modulus = np.where(np.arange(len(directions))[:, None] < model.n_regions, directions, 0.0)
-                along = slice(new, new + directions.shape[1])
-                missing[:, along] += solved(model.boundary_loads(at.moduli, late[:, 0], by_modulus), TANGENT)
+                missing[:, new:] += solved(model.boundary_loads(at.moduli, late[:, 0], by_modulus), TANGENT)
                 cost += SolveCounts(tangent=directions.shape[1])
             displacement = displacement + late.sum(axis=1)
             sharper = replace(_extended(sharper, missing, cost), place=at)
-        with_material = _with_all_material if stale else _with_sharper_material
-        sharper = with_material(sharper, at, displacement, matrix, solved)
-        return sharper if directions is None else _with_exact_gradient(sharper, at, displacement)
+        if stale:
+            return _with_all_material(sharper, at, displacement, matrix, solved)
+        return _with_sharper_material(sharper, at, displacement, matrix, solved)
 
     @property
     def error_counts(self) -> SolveCounts:
@@ -256,25 +248,6 @@ def _with_sharper_material(
         share = np.linalg.pinv(along.T @ metric @ along, hermitian=True) @ (along.T @ metric)
     counts = basis.counts + SolveCounts(tangent=along.shape[1])
     return replace(basis, projection=basis.projection.with_material(before + change @ share), counts=counts)
-
-
-def _with_exact_gradient(
-    basis: ReducedBasis, at: LinearisationPoint, displacement: NDArray[np.float64]
-) -> ReducedBasis:
-    """The responses U to material modes with the exact U^T g along the gradient g at a place, its dual in the basis.
-
-    U + p (s - U^T g)^T / g^T p, p = K^-1 g and s = -G^T p with the forces G of the modes: the least change in energy.
-    """
-    model, gradient = basis.full_model, at.gradient
-    if gradient is None or not model.material.n_modes:
-        return basis
-    load = basis.projection.components(np.asarray(model.constraint.free.T @ gradient)[:, None])
-    dual = np.asarray(model.constraint.free @ basis.projection.spanned(basis.model.system(at.moduli).backward(load)))
-    work, before = float(gradient @ dual[:, 0]), basis.model.output_material
-    if work <= 0.0:
-        return basis
-    lacking = -model.by_material(at.moduli, displacement).work(dual[:, 0]) - before.T @ gradient
-    return replace(basis, projection=basis.projection.with_material(before + dual * (lacking / work)))
 
 
 def _extended(basis: ReducedBasis, snapshots: NDArray[np.float64], cost: SolveCounts) -> ReducedBasis:

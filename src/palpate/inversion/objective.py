@@ -12,7 +12,7 @@ from scipy import linalg
 from palpate.approximation.contract import Approximation, LinearisationPoint, determined
 from palpate.inversion.later_state import LaterState
 from palpate.mechanics.forward import Equilibrium
-from palpate.observation.contract import Observation, OfMaterial, Rematched, Residuals, seen_transposed
+from palpate.observation.contract import Observation, OfMaterial, Rematched, Residuals
 from palpate.observation.jacobian import Jacobian, jacobian_of
 from palpate.parallel import mapped
 from palpate.unknowns.parameters import ParameterMap
@@ -192,11 +192,7 @@ class Objective:
         for s, q in enumerate(coefficients):
             own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
             metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
-            gradient = np.zeros(len(self.states[s].model.constraint.offset))
-            for term in (term for term in evaluation.linearisations if term.state == s):
-                pull = term.residuals.jacobian.T @ (term.precision * term.weights * term.residuals.values)
-                gradient += seen_transposed(term.observation, np.asarray(pull), len(gradient))
-            points.append(LinearisationPoint(moduli, q, chain @ directions[own], metric, gradient))
+            points.append(LinearisationPoint(moduli, q, chain @ directions[own], metric))
         return points
 
     def under(self, approximations: Sequence[Approximation]) -> Objective:

@@ -76,7 +76,7 @@ class StopRule:
     trust region grows no more and no alternative is chosen anew, so that none comes and goes.
     """
 
-    step_sd: float = 0.01
+    step_sd: float = 0.02
     floor: float = 3e-4
     coefficients: float = np.inf
     model_error: float = 1.0
@@ -384,7 +384,7 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
     checks, missing = now.checks, np.inf
     if left < max(1.0, wanted):  # else it is made exact in any case; what sets it off by less than it moves may wait
         _, off, cost = model_error(objective, minimum)
-        checks, missing = checks + cost, size([off]) / rule.model_error
+        checks, missing = checks + cost, float(np.max(off / (rule.model_error * tolerance), initial=0.0))
     if missing >= 1.0:
         points = objective.linearisation_points(unknowns, minimum.evaluation)
         pairs = zip(objective.approximations, points, strict=True)
@@ -393,11 +393,6 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
         steps, across = step.remaining(before.unknowns, minimum.evaluation, bounds, fixed)
         if across:  # by a model that is exact there
             wanted, left, missing = size(steps), 0.0, 0.0
-        elif wanted < 1.0:  # and by what its score still asks for
-            onward = newton_step(minimum.evaluation, bounds.free(unknowns, minimum.evaluation.score, fixed), n)
-            _, off, cost = model_error(objective, minimum)
-            wanted, left, missing = max(wanted, size([onward])), 0.0, size([off]) / rule.model_error
-            checks = checks + cost
     there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals)
     return replace(there, correlated=correlated), spent
 

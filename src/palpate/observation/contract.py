@@ -213,12 +213,6 @@ def seen_by(observation: Observation, displacement: NDArray[Float]) -> NDArray[F
     return np.asarray(observation.interpolation.astype(own.dtype, copy=False) @ own)
 
 
-def seen_transposed(observation: Observation, gradient: NDArray[np.float64], n_dof: int) -> NDArray[np.float64]:
-    """Gradient (n_dof,) by displacements of all points of what has one (n_seen,) by those that are seen."""
-    own = np.asarray(observation.interpolation.T @ gradient) if isinstance(observation, Interpolated) else gradient
-    return np.asarray(np.bincount(observation.dofs, own, n_dof), dtype=np.float64)
-
-
 def n_seen(observation: Observation) -> int:
     """Number of displacements that an observation sees."""
     return int(observation.interpolation.shape[0] if isinstance(observation, Interpolated) else len(observation.dofs))

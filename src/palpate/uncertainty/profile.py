@@ -36,7 +36,7 @@ TRIES = 3  # at a point, of as many steps as a minimum has
 NEAR = 0.05  # of the level, to which an end is found before a line to the estimate corrects it
 FURTHEST = 2.0  # times the distance of the last point: more is not extrapolated
 PASSES = 10
-SETTLED = 0.02  # posterior standard deviations, a hundredth of the half-width of an interval
+SETTLED = 0.02  # posterior standard deviations, as the outer loop's own
 TOLERANCE = 1e-6  # decrement of a minimum
 ON_RAY = 0.01  # of one on a ray, of the 1.92 at an interval's end: a quarter of a per cent of its half-width
 
