@@ -197,7 +197,6 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     """
     parameters, n = objective.parameters, objective.n_parameters
     chosen = list(objective.chosen or (None,) * len(parameters.blocks))
-    hyper_prior = list(objective.hyper_prior or (0.0,) * len(parameters.blocks))
     model, prior = normal_model(parameters, evaluation, unknowns), evaluation.prior.copy()
 
     def choice(i: int) -> tuple[float, int, Belief]:
@@ -223,9 +222,9 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
             i = max(waiting, key=lambda k: choices[k][0])
             waiting.remove(i)
             _, chosen[i], taken = choices[i]
-            hyper_prior[i], prior = taken.hyper_prior, model.believed(i, taken.covariance, prior)
+            prior = model.believed(i, taken.covariance, prior)
     parameters = replace(parameters, nuisance_precision=prior[n:, n:])
-    return replace(objective, parameters=parameters, chosen=tuple(chosen), hyper_prior=tuple(hyper_prior))
+    return replace(objective, parameters=parameters, chosen=tuple(chosen))
 
 
 def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
@@ -269,11 +268,10 @@ def normal_model(parameters: ParameterMap, evaluation: Evaluation, unknowns: NDA
 
 
 class Belief(NamedTuple):
-    """An alternative of a block at its best: log-evidence with all log priors, covariance (m, m), -ln p(a) there."""
+    """An alternative of a block at its best: its log-evidence with its log prior odds, and its covariance (m, m)."""
 
     evidence: float
     covariance: NDArray[np.float64]
-    hyper_prior: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,26 +330,20 @@ def _seen(
 
 
 def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: Block, odds: float) -> Belief:
-    """The largest log-evidence, with the log priors of odds and amplitudes, of a family of priors of a block.
-
-    Of terms that explain the same the evidence is a long valley with more than one end, which the amplitudes' law bars.
-    """
+    """The largest log-evidence, with its log prior odds, of a family of priors of a block."""
     floor = 0.0 if block.acts is Acts.MATERIAL else LEAST_VARIANCE  # a field's levels leave no mode without variance
     floored = [term + floor * np.eye(len(term)) for term in terms]
-    evidence, limits, (mean, sd) = seen.log_evidence(floored), np.log(block.amplitudes), block.log_amplitude
-
-    def hyper_prior(logs: NDArray[np.float64]) -> float:
-        """-ln p of ln of the amplitudes (n_terms,), up to a constant."""
-        return 0.5 * float(np.sum(((logs - mean) / sd) ** 2))
+    evidence, limits = seen.log_evidence(floored), np.log(block.amplitudes)
 
     def worse(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """Minus the log-evidence and log prior at ln of the amplitudes (n_terms,), with its derivative."""
+        """Minus the log-evidence at ln of the amplitudes (n_terms,), with its derivative."""
         squares = np.exp(2.0 * logs)
         value, slopes = evidence(squares)
-        return hyper_prior(logs) - value, (logs - mean) / sd**2 - 2.0 * squares * slopes
+        return -value, -2.0 * squares * slopes
 
     start, bounds = np.zeros(len(terms)).clip(*limits), [tuple(limits)] * len(terms)
+    # to its end: terms that explain the same make a long valley
     best = optimize.minimize(worse, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
     squares = np.exp(2.0 * best.x)
     covariance = sum((s * t for s, t in zip(squares, floored, strict=True)), np.zeros_like(terms[0]))
-    return Belief(odds - float(best.fun), covariance, hyper_prior(best.x))
+    return Belief(odds - float(best.fun), covariance)

@@ -117,14 +117,12 @@ class Objective:
     scales s_k of the observations' `weighting`, the blocks' covariance P^-1, and the numbers of the alternatives
     that are `chosen` for them, with their odds as p(h); the last term integrates over x by Laplace's approximation, H =
     J^T W J + P. A call gives what depends on x at these h, `total` all of it. Each observation has an offset, where
-    `parameters` have one. hyper_prior: -ln p of the amplitudes of each block, up to a constant; learn_last: whether the
-    blocks that are learned last have a choice yet.
+    `parameters` have one. learn_last: whether the blocks that are learned last have a choice yet.
     """
 
     states: tuple[LaterState, ...]
     parameters: ParameterMap
     chosen: tuple[int | None, ...] = ()
-    hyper_prior: tuple[float, ...] = ()
     learn_last: bool = False
 
     @property
@@ -144,7 +142,7 @@ class Objective:
         normal, beyond = self.as_normal(evaluation)
         n = self.n_parameters
         determinants = log_det(evaluation.matrix - evaluation.prior + normal) - log_det(normal[n:, n:])
-        return evaluation.value + (residuals + beyond + sum(self.hyper_prior) - sum(odds) + 0.5 * determinants)
+        return evaluation.value + (residuals + beyond - sum(odds) + 0.5 * determinants)
 
     def as_normal(self, evaluation: Evaluation) -> tuple[NDArray[np.float64], float]:
         """Precision P (n_unknowns, n_unknowns) for the determinants; what J has beside the normal laws of `parameters`.

@@ -382,10 +382,10 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
         return replace(there, correlated=correlated), spent
     left = linearisation_distance(objective, minimum.unknowns) / rule.step_sd if rule.derivatives else 0.0
     checks, missing = now.checks, np.inf
-    if left < max(1.0, wanted):  # else it is made exact in any case; what sets it off by less than it moves may wait
+    if left < 1.0:  # else it is made exact in any case
         _, off, cost = model_error(objective, minimum)
         checks, missing = checks + cost, float(np.max(off / (rule.model_error * tolerance), initial=0.0))
-    if missing >= 1.0:
+    if max(missing, left) >= 1.0:
         points = objective.linearisation_points(unknowns, minimum.evaluation)
         pairs = zip(objective.approximations, points, strict=True)
         objective = objective.under([approximation.update(point) for approximation, point in pairs])

@@ -21,13 +21,12 @@ class Wall:
 
     name: the driver's; columns (n_modes,): the constraint's modes that move it, n_fine more follow them; `drifts`: of
     motions whose components are alike, one for each of `DRIFT_LENGTHS`; `swellings`: of motions along the normals, one
-    for each of `SWELLING_LENGTHS`. All have the modes' own standard deviation, prior_mm.
+    for each of `SWELLING_LENGTHS`. All have the modes' own standard deviation.
     """
 
     name: str
     columns: NDArray[np.int64]
     n_fine: int
-    prior_mm: float
     drifts: tuple[NDArray[np.float64], ...]
     swellings: tuple[NDArray[np.float64], ...]
 
@@ -62,7 +61,6 @@ def wall_of(
         name,
         columns,
         n_fine,
-        prior_mm,
         tuple(np.asarray(np.kron(a @ a.T, np.eye(3))) for a in drifts),
         tuple(np.asarray(a @ a.T) for a in along),
     )

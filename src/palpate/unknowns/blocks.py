@@ -25,7 +25,6 @@ from palpate.observation.wall_modes import Wall
 from palpate.unknowns.total_variation import TotalVariation, total_variation
 
 AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
-WALL_MM, WALL_SD = 0.5, 1.5  # amplitudes of a wall's motions: ln a ~ N(ln 0.5 mm, 1.5^2), 0.025 to 10 mm by 95 %
 STILL, SLIGHT = 0.02, 0.1  # of a frame that stands still, that hardly moves, times one that moves
 MOVES = (1.0, 2.0)  # amplitudes of a frame, times what is stated
 STILL_RIGID, MOVED_RIGID = 0.005, 0.2
@@ -58,8 +57,7 @@ class Block:
     of: the tissue that it is of, or the frame; cause: by which shares of a variance are told; unit_mm: what a
     coefficient of 1 is worth where it is a motion; precision: P (n, n) before anything is learned. alternatives:
     families of covariances sum_t a_t^2 C_t (n, n), each the tuple of its terms C_t, of which the images choose one with
-    its amplitudes a_t, by their evidence; none where P is held. amplitudes: bounds of a_t; log_amplitude: mean and
-    standard deviation of ln a_t ~ N(m, s^2), infinite where nothing is believed; odds: log prior odds of the
+    its amplitudes a_t, by their evidence; none where P is held. amplitudes: bounds of a_t; odds: log prior odds of the
     alternatives, of which the likeliest is taken; none: of alternatives that are alike the widest. considered: the
     images cannot tell them, so that they are held at 0, and what they may be counts in the covariance (Schmidt 1966).
     last: its prior is learned where the estimate has converged under those of the others; before it would take what
@@ -93,7 +91,6 @@ class Block:
     share: float = 1.0
     left_out: float = LEFT_OUT
     variation: TotalVariation | None = None
-    log_amplitude: tuple[float, float] = (0.0, np.inf)
 
     def __post_init__(self) -> None:
         shape = (len(self.precision),) * 2
@@ -143,9 +140,8 @@ def wall_blocks(wall: Wall, state: int, *, learned: bool = True) -> tuple[Block,
     n, m = len(wall.columns), wall.n_fine
     terms = [linalg.block_diag(of, np.zeros((m, m))) for of in (*wall.drifts, *wall.swellings)]
     terms += [np.diag(np.repeat([0.0, 1.0], [n, m]))] if m else []
-    own = (wall.name, "driver", Acts.BOUNDARY, (state,), np.eye(n + m), (tuple(terms),) if learned else ())
-    law = (float(np.log(WALL_MM / wall.prior_mm)), WALL_SD)
-    return (Block(*own, log_amplitude=law),) if n + m else ()
+    block = Block(wall.name, "driver", Acts.BOUNDARY, (state,), np.eye(n + m), (tuple(terms),) if learned else ())
+    return (block,) if n + m else ()
 
 
 def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
