@@ -486,7 +486,7 @@ def test_what_is_not_met_is_not_called_converged(name):
 
 
 def test_too_few_iterations_are_not_called_convergence(twins, voxels):
-    rule = StopRule(step_sd=1e-5, floor=0.0, iterations=1)
+    rule = StopRule(iterations=1)
     found = invert(voxels, twins.settings(0.5), progress=twins.silent, rule=rule)
     assert found.minimum.outcome is Outcome.STEPS
     assert not found.convergence.converged

@@ -150,24 +150,26 @@ def with_released(
     does not end the inversion says why. Nothing changes where there is no such block, or no minimum to follow.
     """
     best = inversion.candidates[inversion.best]
-    fixed, released = best.iterate, [block for block in inversion.objective.parameters.blocks if block.released]
-    if not fixed.minimum.converged or not released:
+    before, released = best.iterate, [block for block in inversion.objective.parameters.blocks if block.released]
+    if not before.minimum.converged or not released:
         return inversion
-    unknowns, bounds = fixed.minimum.unknowns, settings.bounds
+    unknowns, bounds = before.minimum.unknowns, settings.bounds
     followed, title = inversion, f"with {' and '.join(dict.fromkeys(block.cause for block in released))} free"
     try:
-        objective, evaluation = fixed.objective.released(fixed.minimum.evaluation, unknowns)
+        objective, evaluation = before.objective.released(before.minimum.evaluation, unknowns)
         points = objective.linearisation_points(unknowns, evaluation)
         near = [known.update(point) for known, point in zip(objective.approximations, points, strict=True)]
-        start = replace(begun(objective.under(near), unknowns, history=fixed.minimum.history[:-1]), checks=fixed.checks)
+        start = replace(
+            begun(objective.under(near), unknowns, history=before.minimum.history[:-1]), checks=before.checks
+        )
         end = free = minimised(start, bounds, NEAR, progress=progress, title=title)
-        followed = _followed(inversion, fixed, free, free)
-        gain = fixed.objective.total(fixed.minimum.evaluation) - total_counted_as(free, fixed)
+        followed = _followed(inversion, before, free, free)
+        gain = before.objective.total(before.minimum.evaluation) - total_counted_as(free, before)
         gain += min(block.released_odds for block in released)
         if free.minimum.converged and gain > AS_GOOD:
             end = minimised(free, bounds, rule, progress=progress, title=title)
             end = _at_equilibrium(end) if inversion.objective.states[0].finite_strain else end
-            followed = _followed(inversion, fixed, free, end)
+            followed = _followed(inversion, before, free, end)
     except EstimationError as error:
         return replace(followed, unsettled=str(error))
     if not end.minimum.converged:
@@ -179,9 +181,9 @@ def with_released(
     return replace(followed, candidates=tuple(candidates), released=None)
 
 
-def _followed(inversion: Inversion, fixed: OuterIterate, free: OuterIterate, end: OuterIterate) -> Inversion:
-    """The inversion with its best minimum `free`, and with what it cost to follow this from `fixed` to `end`."""
-    spent, evaluations = end.counts - fixed.counts, inversion.evaluations + end.minimum.evaluations
+def _followed(inversion: Inversion, before: OuterIterate, free: OuterIterate, end: OuterIterate) -> Inversion:
+    """The inversion with its best minimum `free`, and with what it cost to follow this from `before` to `end`."""
+    spent, evaluations = end.counts - before.counts, inversion.evaluations + end.minimum.evaluations
     return replace(inversion, evaluations=evaluations, counts=inversion.counts + spent, released=free)
 
 
