@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from palpate.approximation.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.errors import ConfigurationError, EstimationError, NotConverged
 from palpate.inversion.candidates import COMPARED, Inversion, StartRun, as_good, concluded, grouped, members
-from palpate.inversion.frozen_posterior import fixed_correspondence, frozen_posterior
+from palpate.inversion.frozen_posterior import cheapest
 from palpate.inversion.hyper_parameters import with_first_noise
 from palpate.inversion.informed_subspace import informed_problem
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import AS_GOOD, Objective
 from palpate.inversion.optimise import (
     Bounds,
-    LeastSquares,
     Minimum,
     Outcome,
     gauss_newton,
@@ -159,9 +158,9 @@ def with_released(
         objective, evaluation = before.objective.released(before.minimum.evaluation, unknowns)
         points = objective.linearisation_points(unknowns, evaluation)
         near = [known.update(point) for known, point in zip(objective.approximations, points, strict=True)]
-        start = replace(
-            begun(objective.under(near), unknowns, history=before.minimum.history[:-1]), checks=before.checks
-        )
+        objective = objective.under(near)
+        start = begun(objective, _on_cheapest(objective, unknowns, bounds), history=before.minimum.history)
+        start = replace(start, checks=before.checks)
         end = free = minimised(start, bounds, NEAR, progress=progress, title=title)
         followed = _followed(inversion, before, free, free)
         gain = before.objective.total(before.minimum.evaluation) - total_counted_as(free, before)
@@ -257,15 +256,22 @@ def _screened(first: OuterIterate, settings: InversionSettings, progress: Progre
     """
     at, n = first.minimum, first.objective.n_parameters
     progress(f"{len(settings.every_start)} starts, with the closest points of the first minimum")
-    try:
-        cheap: LeastSquares = frozen_posterior(first.objective, at.unknowns, at.evaluation)
-    except ConfigurationError:
-        cheap = fixed_correspondence(first.objective, at.unknowns, at.evaluation)
-    found = []
+    cheap, found = cheapest(first.objective, at.unknowns, at.evaluation), list[Minimum]()
     for theta in settings.every_start:
         begin = np.concatenate([theta, at.unknowns[n:]])
         found.append(gauss_newton(cheap, begin, bounds=settings.bounds, tolerance=AS_GOOD / 200.0))
     return found
+
+
+def _on_cheapest(objective: Objective, unknowns: NDArray[np.float64], bounds: Bounds) -> NDArray[np.float64]:
+    """Unknowns (n_unknowns,) of the minimum on the cheapest model, or on the way there as far as models are trusted."""
+    cheap = cheapest(objective, unknowns, objective(unknowns))
+    found = gauss_newton(cheap, unknowns, bounds=bounds, tolerance=AS_GOOD / 200.0)
+    away = found.unknowns - unknowns if found.converged else np.zeros(len(unknowns))
+    moduli = np.append(np.arange(objective.n_parameters), objective.parameters.acting_on_moduli)
+    furthest = float(np.max(np.abs(away[moduli]), initial=0.0))
+    trusted = min(approximation.trust_radius for approximation in objective.approximations)
+    return np.asarray(unknowns + min(1.0, trusted / max(furthest, 1e-9)) * away)
 
 
 def _coarse(linear: OuterIterate) -> tuple[Objective, list[FiniteStrainEquilibrium]]:

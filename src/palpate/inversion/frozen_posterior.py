@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
+from palpate.inversion.optimise import LeastSquares
 from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
@@ -227,3 +228,14 @@ def frozen_posterior(
             square += own / len(evaluation.linearisations)
         states.append(replace(bare, form=form, square=square))
     return FrozenPosterior(objective, tuple(states), evaluation.prior)
+
+
+def cheapest(objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation) -> LeastSquares:
+    """The objective with closest points and hyper-parameters as at an evaluation at `unknowns` (n,).
+
+    Where its models are no reduced ones, on what only has the former.
+    """
+    try:
+        return frozen_posterior(objective, unknowns, evaluation)
+    except ConfigurationError:
+        return fixed_correspondence(objective, unknowns, evaluation)
