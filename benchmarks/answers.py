@@ -107,10 +107,9 @@ def plain_estimate(
     problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]
 ) -> OuterIterate:
     """The estimate from the middle start, the full model solved with all its derivatives at every place."""
-    theta, bounds = np.asarray(np.median(np.stack(settings.starts), axis=0)), settings.bounds
-    still = np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
+    still, bounds = settings.middle(problem), settings.bounds
     objective = with_first_noise(_exact(Objective(problem.states, problem.parameters), still)).rematched(still)
-    filled = fit_coefficients(objective, still, bounds=bounds)
+    filled = fit_coefficients(objective, still)
     start = begun(_exact(objective, filled.unknowns), filled.unknowns)  # at rest no modulus shows
     found = minimised(start, bounds, RULE, progress=progress, title="linear law")
     if not problem.finite_strain:

@@ -230,7 +230,7 @@ def test_where_the_trust_region_cuts_a_step_short_no_hyper_parameter_moves(twins
     problem, settings = twins.exact_problem(twin), twins.settings(0.1)
     unknowns = np.concatenate([settings.starts[0], np.zeros(len(twin.coefficients))])
     basis = twins.objective_of(problem, twin.coefficients)
-    filled = fit_coefficients(with_first_noise(basis), unknowns, bounds=settings.bounds)
+    filled = fit_coefficients(with_first_noise(basis), unknowns)
     start = begun(with_first_noise(basis), filled.unknowns)
     one = minimised(start, settings.bounds, replace(CHEAP, iterations=1), progress=twins.silent, title="")
     assert np.abs(one.minimum.unknowns - filled.unknowns)[:2].max() == pytest.approx(0.5 * RADIUS)
@@ -292,7 +292,7 @@ def test_where_the_score_leads_on_and_the_objective_is_no_lower_a_step_tells_not
         settled=False,
     )
     bounds = twins.settings(0.5).bounds
-    there, _ = trust_region._evaluated(step, begin, bounds, replace(CHEAP, floor=0.0), fixed=False)
+    there, _ = trust_region._evaluated(step, begin, bounds, replace(CHEAP, floor=0.0))
     whole = ends_at / CHEAP.step_sd
     assert there.convergence.step == pytest.approx(whole, rel=0.1) if counts else there.convergence.step < 0.1 * whole
 
@@ -360,7 +360,7 @@ def test_independent_residuals_are_counted_before_an_alternative_is_chosen(twins
     )
     chosen = replace(chosen, objective=replace(chosen.objective, chosen=(0,)))
     for start, counted in ((first, True), (chosen, False), (waits, False)):
-        step = trust_region._linear_minimum(start, bounds, CHEAP, TrustRegion(radius=0.01), fixed=False)
+        step = trust_region._linear_minimum(start, bounds, CHEAP, TrustRegion(radius=0.01))
         assert step.cut
         before, after = (of.objective.n_independent for of in (start, step))
         assert after < before if counted else after == before
@@ -393,7 +393,7 @@ def test_bounds_hold_and_what_they_hold_back_is_a_minimum(twins, voxels):
 def test_log_moduli_that_are_held_stay(twins, twin, voxels):
     objective = twins.objective_of(voxels, twin.coefficients)
     unknowns = np.append([0.3, 0.1], np.zeros(len(twin.coefficients)))
-    fitted = fit_coefficients(objective, unknowns, bounds=twins.settings(1.0).bounds)
+    fitted = fit_coefficients(objective, unknowns)
     assert fitted.converged
     assert np.array_equal(fitted.unknowns[:2], unknowns[:2])
     assert objective.rematched(fitted.unknowns)(fitted.unknowns).value < 0.2 * objective(unknowns).value

@@ -42,7 +42,8 @@ def test_at_the_ends_the_objective_is_higher_by_the_level_at_its_best(objective,
     for end in (found.low, found.high):
         start = minimum.unknowns.copy()
         start[0] = end
-        best = gauss_newton(fixed, start, bounds=WIDE, fixed=np.array([True, False]), tolerance=1e-8)
+        own = WIDE.fixed(start[:2], np.array([True, False]))
+        best = gauss_newton(fixed, start, bounds=own, tolerance=1e-8)
         assert best.unknowns[0] == end
         assert 2.0 * (best.evaluation.value - least) == pytest.approx(NORMAL_95**2, rel=0.05)
 

@@ -3,7 +3,6 @@
 from palpate.inversion.candidates import Inversion as Inversion
 from palpate.inversion.candidates import StartRun as StartRun
 from palpate.inversion.candidates import as_good as as_good
-from palpate.inversion.driver_fit import fit_driver as fit_driver
 from palpate.inversion.estimate import InversionSettings as InversionSettings
 from palpate.inversion.estimate import continue_at_finite_strain as continue_at_finite_strain
 from palpate.inversion.estimate import first_noise_of as first_noise_of

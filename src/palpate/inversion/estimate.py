@@ -55,6 +55,11 @@ class InversionSettings:
         """All starts (n_parameters,), the further ones last."""
         return self.starts + self.further
 
+    def middle(self, problem: InverseProblem) -> NDArray[np.float64]:
+        """Unknowns (n_unknowns,) of a problem at the middle of the `starts`, where nothing else acts."""
+        theta = np.median(np.stack(self.starts), axis=0)
+        return np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
+
 
 @blas_on_one_thread()
 def invert(
@@ -73,11 +78,10 @@ def invert(
             "a Poisson's ratio can be sought under the linear law only: the finite-strain models hold those of the"
             " tissues; seek none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
         )
-    middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
-    begin = np.concatenate([middle, np.zeros(problem.parameters.n_coefficients)])
+    begin = settings.middle(problem)
     last = None if problem.finite_strain else rule
     if any(state.approximation is None for state in problem.states):
-        linear = [_linear(*_with_reduced_bases(problem, settings, begin, progress), settings, last, progress)]
+        linear = [_linear(*_with_reduced_bases(problem, begin, progress), settings, last, progress)]
     else:
         linear = [_linear(Objective(problem.states, problem.parameters), begin, 0, settings, last, progress)]
     if not problem.finite_strain:
@@ -96,9 +100,7 @@ def first_noise_of(
     Its minimum is near the middle start, and no estimate: no other start and no exact derivative was tried. Raises as
     `invert` does.
     """
-    middle = np.asarray(np.median(np.stack(settings.starts), axis=0))
-    begin = np.concatenate([middle, np.zeros(problem.parameters.n_coefficients)])
-    objective, unknowns, _ = _with_reduced_bases(problem.linear(), settings, begin, progress)
+    objective, unknowns, _ = _with_reduced_bases(problem.linear(), settings.middle(problem), progress)
     objective = with_first_noise(objective).rematched(np.zeros(objective.parameters.n_unknowns))
     nearby = minimised(begun(objective, unknowns), settings.bounds, NEAR, progress=progress, title="the middle start")
     return nearby.objective, nearby.minimum
@@ -187,13 +189,13 @@ def _followed(inversion: Inversion, before: OuterIterate, free: OuterIterate, en
 
 
 def _with_reduced_bases(
-    problem: InverseProblem, settings: InversionSettings, middle: NDArray[np.float64], progress: Progress
+    problem: InverseProblem, begin: NDArray[np.float64], progress: Progress
 ) -> tuple[Objective, NDArray[np.float64], int]:
-    """The objective on reduced bases at unknowns (n_unknowns,), these with the drivers' motion fitted, its cost.
+    """The objective on reduced bases, unknowns `begin` (n_unknowns,) with the drivers' motion fitted, what it cost.
 
     Its blocks hold what the images tell of those of the problem.
     """
-    informed = informed_problem(problem, middle, bounds=settings.bounds, progress=progress)
+    informed = informed_problem(problem, begin, progress=progress)
     parameters, unknowns = informed.problem.parameters, informed.unknowns
     progress(f"how the responses to {parameters.n_coefficients} unknowns that are seen change with the moduli")
     by_theta, coefficients = parameters.derivatives(unknowns), parameters.coefficients(unknowns)

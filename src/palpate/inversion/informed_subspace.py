@@ -17,7 +17,6 @@ from palpate.approximation.reduced_basis import SNAPSHOT, ReducedBasis, basis_of
 from palpate.inversion.hyper_parameters import with_first_noise
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Objective
-from palpate.inversion.optimise import Bounds
 from palpate.inversion.trust_region import fit_coefficients
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
@@ -39,9 +38,7 @@ class InformedProblem:
     evaluations: int
 
 
-def informed_problem(
-    problem: InverseProblem, begin: NDArray[np.float64], *, bounds: Bounds, progress: Progress
-) -> InformedProblem:
+def informed_problem(problem: InverseProblem, begin: NDArray[np.float64], *, progress: Progress) -> InformedProblem:
     """The problem on what the images tell of its blocks, by the responses of the full models at `begin` (n_unknowns,).
 
     x of a block with the widest covariance C = L L^T is seen along the eigenvectors of L^T A L, A = J^T W J its
@@ -57,7 +54,7 @@ def informed_problem(
         states.append(replace(state, observed=found[-1].seen(state, np.zeros(state.model.n_modes))))
     progress("the motion of walls and frame at the middle start")
     objective = with_first_noise(Objective(tuple(states), parameters)).rematched(begin)
-    fitted = fit_coefficients(objective, begin, bounds=bounds)
+    fitted = fit_coefficients(objective, begin)
     progress("what the images tell of all unknowns there")
     for s, (state, q) in enumerate(zip(objective.states, parameters.coefficients(fitted.unknowns), strict=True)):
         found[s] = found[s].with_material(q)

@@ -61,16 +61,16 @@ class Bounds:
         """Which of theta (n_parameters,) lie at a bound: what holds them there is the search, not the images."""
         return np.asarray((theta <= self.lower) | (theta >= self.upper))
 
-    def free(
-        self, unknowns: NDArray[np.float64], score: NDArray[np.float64], fixed: NDArray[np.bool_] | bool
-    ) -> NDArray[np.bool_]:
-        """Which unknowns (n,) may move: no log-modulus that is `fixed`, or that the score (n,) pulls out of a bound.
+    def fixed(self, theta: NDArray[np.float64], which: NDArray[np.bool_] | bool = True) -> Bounds:
+        """Those between which the log-moduli `which` (n_parameters,), or all, keep the values theta (n_parameters,)."""
+        return Bounds(np.where(which, theta, self.lower), np.where(which, theta, self.upper))
 
-        fixed: which log-moduli (n_parameters,) are, or whether all.
-        """
+    def free(self, unknowns: NDArray[np.float64], score: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which unknowns (n,) may move: no log-modulus without room, or that the score (n,) pulls out of a bound."""
         n = len(self.lower)
         theta, slope = unknowns[:n], score[:n]
-        still = ((theta <= self.lower) & (slope > 0.0)) | ((theta >= self.upper) & (slope < 0.0)) | fixed
+        still = ((theta <= self.lower) & (slope > 0.0)) | ((theta >= self.upper) & (slope < 0.0))
+        still |= self.lower >= self.upper
         return np.concatenate([~still, np.ones(len(unknowns) - n, dtype=bool)])
 
 
@@ -158,7 +158,6 @@ def gauss_newton(
     start: NDArray[np.float64],
     *,
     bounds: Bounds,
-    fixed: NDArray[np.bool_] | bool = False,
     tolerance: float = 1e-3,
     within: NDArray[np.float64] | float = np.inf,
     max_steps: int = 40,
@@ -169,8 +168,7 @@ def gauss_newton(
     Step: (J^T W J + P + mu D) d = -s, s the score, with the log-moduli's part no longer than the trust radius; a step
     is taken when it reduces the objective (Nocedal & Wright 2006, Algorithm 4.1). It ends when the decrement -s.d / 2,
     the reduction that the quadratic model still promises in units of log-likelihood, is under `tolerance` and the step
-    to the model's minimum moves each log-modulus by less than `within` (one number, or (n_parameters,)). `fixed`: which
-    log-moduli (n_parameters,) keep their values, or whether all do.
+    to the model's minimum moves each log-modulus by less than `within` (one number, or (n_parameters,)).
     """
     unknowns, region, history, n = start.copy(), TrustRegion(), list[Iterate](), objective.n_parameters
     now, evaluations, outcome = begin or objective(unknowns), 1, Outcome.STEPS
@@ -178,7 +176,7 @@ def gauss_newton(
         if not np.isfinite(now.value):
             outcome = Outcome.NOT_FINITE
             break
-        quadratic = _QuadraticModel.of(now, bounds.free(unknowns, now.score, fixed), n)
+        quadratic = _QuadraticModel.of(now, bounds.free(unknowns, now.score), n)
         whole = quadratic.step()
         decrement = -0.5 * float(now.score @ whole)
         history.append(Iterate(unknowns[:n], now.value, now.misfit_mm2, decrement))

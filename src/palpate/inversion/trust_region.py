@@ -158,7 +158,7 @@ class _Step:
         return max(gain, self.begin.value - there.value), promised
 
     def remaining(
-        self, unknowns: NDArray[np.float64], there: Evaluation, bounds: Bounds, fixed: bool
+        self, unknowns: NDArray[np.float64], there: Evaluation, bounds: Bounds
     ) -> tuple[list[NDArray[np.float64]], bool]:
         """Steps (n,) by which a minimum may be missed after one from unknowns (n,); whether they are across that one.
 
@@ -167,7 +167,7 @@ class _Step:
         it: errors of the normals pull a wall along itself, always alike, and no residual changes as they promise.
         """
         end, n = self.minimum.unknowns, self.objective.n_parameters
-        taken, onward = end - unknowns, newton_step(there, bounds.free(end, there.score, fixed), n)
+        taken, onward = end - unknowns, newton_step(there, bounds.free(end, there.score), n)
         along = float(taken @ there.matrix @ onward) / max(float(taken @ there.matrix @ taken), 1e-30)
         if not self.cut and along > 0.5 and self.total(there) >= self.now:
             return [onward - along * taken], True
@@ -181,12 +181,11 @@ def minimised(
     *,
     progress: Callable[[str], None],
     title: str,
-    fixed: bool = False,
 ) -> OuterIterate:
     """Lower the objective from `start` until a stop rule is met.
 
     Where it is met the blocks choose their alternatives afresh, and the loop goes on from there; of the minima that it
-    finds so the likeliest is returned. fixed: whether the log-moduli stay. `title` begins each line of `progress`.
+    finds so the likeliest is returned. `title` begins each line of `progress`.
     History and evaluations are added to those of `start`. Raises `NotConverged` when the full model has no equilibrium
     where every trial leads.
     """
@@ -197,7 +196,7 @@ def minimised(
         heading, early = f"{title}, iteration {number}", 2 * number <= rule.iterations
         lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
         progress(f"{heading}: {now.objective.parameters.in_words(now.minimum.unknowns)}{lowered}")
-        now, region = _iteration(now, bounds, rule, region, fixed, grows=early)
+        now, region = _iteration(now, bounds, rule, region, grows=early)
         if now.minimum.outcome is Outcome.STUCK:
             break
         if ends and number == last + TRIED and total_counted_as(now, now) >= total_counted_as(ends[-1], now):
@@ -211,17 +210,18 @@ def minimised(
     return _likeliest(ends, now) if ends else now
 
 
-def fit_coefficients(objective: Objective, begin: NDArray[np.float64], *, bounds: Bounds) -> Minimum:
+def fit_coefficients(objective: Objective, begin: NDArray[np.float64]) -> Minimum:
     """The best coefficients of the blocks at the log-moduli of `begin` (n_unknowns,), sought from there.
 
     To a fifth of their standard deviations each, in the mean.
     """
     rule = StopRule(step_sd=np.inf, coefficients=0.02, model_error=np.inf, derivatives=False, learn=False)
-    return minimised(begun(objective, begin), bounds, rule, progress=silent, title="coefficients", fixed=True).minimum
+    theta = begin[: objective.n_parameters]
+    return minimised(begun(objective, begin), Bounds(theta, theta), rule, progress=silent, title="coefficients").minimum
 
 
 def _iteration(
-    now: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, fixed: bool, *, grows: bool
+    now: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, *, grows: bool
 ) -> tuple[OuterIterate, TrustRegion]:
     """One accepted step, or `STUCK` where none of some trials is; the region for the next, and whether it may grow.
 
@@ -233,11 +233,11 @@ def _iteration(
     moduli = np.append(np.arange(n), now.objective.parameters.acting_on_moduli)
     failure, trial_evaluations = None, 0
     for _ in range(TRIALS):
-        step = _linear_minimum(now, bounds, rule, region, fixed)
+        step = _linear_minimum(now, bounds, rule, region)
         moved = np.abs(step.minimum.unknowns - before.unknowns)
         longest = float(np.max(moved[moduli], initial=0.0))
         try:
-            there, spent = _evaluated(step, now, bounds, rule, fixed)
+            there, spent = _evaluated(step, now, bounds, rule)
         except NotConverged as error:
             failure, region = error, region.smaller(longest)
             continue
@@ -305,7 +305,7 @@ def _numbers(objective: Objective) -> tuple[int | None, ...]:
     return objective.chosen or (None,) * len(objective.parameters.blocks)
 
 
-def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, fixed: bool) -> _Step:
+def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion) -> _Step:
     """Unknowns and hyper-parameters with the least objective on residuals linear around a minimum so far.
 
     In turn, each of which lowers it: unknowns under given hyper-parameters, and these (see `with_hyper_parameters`).
@@ -322,7 +322,7 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
 
     def least(linear: LinearisedObjective, begin: NDArray[np.float64]) -> tuple[Minimum, bool]:
         """Its minimum, or how far on the way there what else acts on moduli may go; whether that is it."""
-        found = gauss_newton(linear, begin, bounds=near, fixed=fixed, tolerance=INNER, within=within)
+        found = gauss_newton(linear, begin, bounds=near, tolerance=INNER, within=within)
         whole = found.unknowns - at.unknowns
         furthest = float(np.max(np.abs(whole[objective.parameters.acting_on_moduli]), initial=0.0))
         if furthest <= radius and not linear.damping:
@@ -334,7 +334,7 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     found, shortened = least(LinearisedObjective(objective, at.unknowns, at.evaluation, damping), at.unknowns)
     theta = found.unknowns[:n]
     low, high = (theta <= near.lower) & (near.lower > bounds.lower), (theta >= near.upper) & (near.upper < bounds.upper)
-    cut = damping > 0.0 or shortened or (not fixed and bool(np.any(low | high)))
+    cut = damping > 0.0 or shortened or bool(np.any(low | high))
     now, total = objective.total(at.evaluation), objective.total(found.evaluation)
     if damping or not rule.learn:
         return _Step(objective, found, at.evaluation, now, total, cut, settled=False)
@@ -360,7 +360,7 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     return _Step(objective, found, begin, now, total, cut, settled)
 
 
-def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, fixed: bool) -> tuple[OuterIterate, int]:
+def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule) -> tuple[OuterIterate, int]:
     """The objective at the end of a step, its model made exact there where its error matters; the evaluations spent."""
     n, before, unknowns = step.objective.n_parameters, now.minimum, step.minimum.unknowns
     objective = step.objective.rematched(unknowns)
@@ -371,7 +371,7 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
         """The furthest that one of them (n_unknowns,) moves a log-modulus, over what it may."""
         return max(float(np.max(np.abs(d[:n]) / tolerance, initial=0.0)) for d in steps)
 
-    steps, _ = step.remaining(before.unknowns, minimum.evaluation, bounds, fixed)
+    steps, _ = step.remaining(before.unknowns, minimum.evaluation, bounds)
     wanted = size(steps)
     if np.isfinite(rule.coefficients):
         decrement = max(0.5 * float(d @ before.evaluation.matrix @ d) for d in steps)
@@ -390,7 +390,7 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule, f
         pairs = zip(objective.approximations, points, strict=True)
         objective = objective.under([approximation.update(point) for approximation, point in pairs])
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
-        steps, across = step.remaining(before.unknowns, minimum.evaluation, bounds, fixed)
+        steps, across = step.remaining(before.unknowns, minimum.evaluation, bounds)
         if across:  # by a model that is exact there
             wanted, left, missing = size(steps), 0.0, 0.0
     there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals)

@@ -101,11 +101,11 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
     noise_of = error_noise(nearby.evaluation)
     progress("the information of the images at the guessed moduli")
     guess, stated = nearby.unknowns.copy(), {tissue.name: tissue.modulus_kpa for tissue in case.tissues}
-    guess[: objective.n_parameters] = np.median(np.stack(settings.starts), axis=0)
+    guess[: objective.n_parameters] = settings.middle(problem)[: objective.n_parameters]
     for i, name in enumerate(objective.parameters.tissues):
         if (kpa := stated.get(name)) is not None:
             guess[i] = float(np.log(kpa / objective.parameters.scale_kpa))
-    fitted = fit_coefficients(objective, guess, bounds=settings.bounds)
+    fitted = fit_coefficients(objective, guess)
     found = covariance_of(objective, fitted.evaluation, (), unknowns=fitted.unknowns, noise_of=noise_of)
     free = sandwich_covariance(*objective.released(fitted.evaluation, fitted.unknowns), noise_of)
     found = found.with_released(objective, fitted.evaluation, free)

@@ -13,7 +13,6 @@ from palpate.findings import Finding
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation, first_labels
 from palpate.images.tissue import Role, Tissue
-from palpate.inversion import fit_driver
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.equilibrium import equilibrium
@@ -29,6 +28,7 @@ from palpate.progress import Progress, silent
 from palpate.study.body import Body, inverse_problem, make_body, strained_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
+from palpate.study.driver_fit import fit_driver
 from palpate.study.provenance import input_digests, software_versions
 from palpate.study.read import phantom_scene, read_states
 from palpate.study.result import MeshSummary, Provenance, Simulation

@@ -115,8 +115,9 @@ class Ray:
 
     def _at_its_best(self, start: NDArray[np.float64]) -> Minimum:
         """All that is not held at its best, sought from unknowns (n,), and once more from where that did not end."""
+        bounds = self.bounds.fixed(start[: len(self.held)], self.held)
         for _ in range(TRIES):
-            found = gauss_newton(self.fixed, start, bounds=self.bounds, fixed=self.held, tolerance=ON_RAY)
+            found = gauss_newton(self.fixed, start, bounds=bounds, tolerance=ON_RAY)
             if found.converged:
                 break
             start = found.unknowns

@@ -62,14 +62,14 @@ def _fitted(
     objective: Objective, models: Sequence[Approximation], coefficients: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
     """Driver coefficients of each state that bring the walls to the images, from given ones, all in one row."""
-    begin = np.concatenate([np.zeros(objective.n_parameters), coefficients])
-    bounds = Bounds(*np.outer([-1.0, 1.0], np.ones(objective.n_parameters)))
+    still = np.zeros(objective.n_parameters)
     objective = objective.under(models).with_observations(
         [o.with_noise(SEGMENTATION_NOISE) for o in objective.observations]
     )
-    first = fit_coefficients(objective, begin, bounds=bounds)
+    first = fit_coefficients(objective, np.concatenate([still, coefficients]))
     objective = with_amplitudes(objective, first.evaluation, first.unknowns)
-    found = minimised(begun(objective, first.unknowns), bounds, ON_WALL, progress=silent, title="", fixed=True).minimum
+    begin, fixed = begun(objective, first.unknowns), Bounds(still, still)
+    found = minimised(begin, fixed, ON_WALL, progress=silent, title="").minimum
     if not found.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
     return objective.parameters.coefficients(found.unknowns)
