@@ -129,28 +129,21 @@ def _of_each(objective: Objective, change: Callable[[int, Observation], Observat
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
-    """What the data say of one block when all else follows: information A (n, n) and pull b = A x - J^T W r (n,)."""
-
-    information: NDArray[np.float64]
-    pull: NDArray[np.float64]
-
-    def whitened(self) -> _Whitened:
-        """The same in the data's own directions: what rounding makes is left out, but for the one that is seen most."""
-        sizes, vectors = linalg.eigh(self.information, check_finite=False)
-        number = np.finfo(np.float64)
-        kept = sizes > len(sizes) * number.eps * sizes[-1]
-        kept[-1] = True
-        roots, axes = np.sqrt(np.maximum(sizes[kept], number.tiny)), vectors[:, kept].T
-        return _Whitened(roots[:, None] * axes, axes @ self.pull / roots)
-
-
-@dataclass(frozen=True, slots=True)
 class _Whitened:
     """Root R (r, n) and target t (r,), dimensionless, of an information A = R^T R and a pull b = R^T t."""
 
     root: NDArray[np.float64]
     target: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, information: NDArray[np.float64], pull: NDArray[np.float64]) -> _Whitened:
+        """Those in the data's own directions: what rounding makes is left out, but for the one that is seen most."""
+        sizes, vectors = linalg.eigh(information, check_finite=False)
+        number = np.finfo(np.float64)
+        kept = sizes > len(sizes) * number.eps * sizes[-1]
+        kept[-1] = True
+        roots, axes = np.sqrt(np.maximum(sizes[kept], number.tiny)), vectors[:, kept].T
+        return cls(roots[:, None] * axes, axes @ pull / roots)
 
     def log_evidence(self, terms: Sequence[NDArray[np.float64]]) -> LogEvidence:
         """F = 1/2 (b^T (A + C^-1)^-1 b - ln det(1 + C A)) of C = sum_t v_t C_t, C_t (n, n) the terms of a prior.
@@ -245,8 +238,8 @@ def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[n
         assert variation is not None
         centre[columns] = 0.0
         with determined():
-            seen = _seen(model.data + prior, model.data, model.pull + prior @ centre, columns)
-            x = variation.least(seen.information, seen.pull, unknowns[columns])
+            seen = _schur_complement(model.data + prior, model.data, model.pull + prior @ centre, columns)
+            x = variation.least(*seen, unknowns[columns])
             prior[np.ix_(columns, columns)] = curvature = variation.curvature(x)
             away = linalg.solve(curvature, variation.gradient(x), assume_a="pos")
         centre[columns] = x - away
@@ -287,7 +280,7 @@ class NormalModel:
         block, columns = _admissible(self.parameters.blocks, i, chosen), self.parameters.columns(i)
         pull, odds = self.pull + prior @ self.parameters.prior_centre, block.odds or (0.0,) * len(block.alternatives)
         with determined():
-            seen = _seen(self.data + prior, self.data, pull, columns).whitened()
+            seen = _Whitened.of(*_schur_complement(self.data + prior, self.data, pull, columns))
             return [_most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)]
 
     def beliefs_beside(self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]) -> list[Belief]:
@@ -311,12 +304,13 @@ class NormalModel:
         return found
 
 
-def _seen(
+def _schur_complement(
     matrix: NDArray[np.float64], data: NDArray[np.float64], pull: NDArray[np.float64], columns: NDArray[np.int64]
-) -> _Seen:
-    """The Schur complement of the information `data` on the unknowns `columns`, the others under their prior.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What data say of k unknowns `columns` when all else follows: information A (k, k), pull b = A x - J^T W r (k,).
 
-    matrix (n, n): the data's and the prior's; pull (n,): likewise, with the prior's mean.
+    The Schur complement of the information `data`, the others under their prior; matrix (n, n): the data's and the
+    prior's; pull (n,): likewise, with the prior's mean.
     """
     rest = np.setdiff1d(np.arange(len(pull)), columns)
     across = data[np.ix_(rest, columns)]
@@ -326,7 +320,7 @@ def _seen(
     right = scale[:, None] * np.column_stack([across, pull[rest]])
     followed = across.T @ (scale[:, None] * linalg.solve(scaled, right, assume_a="pos", check_finite=False))
     information = data[np.ix_(columns, columns)] - followed[:, :-1]
-    return _Seen(0.5 * (information + information.T), pull[columns] - followed[:, -1])
+    return 0.5 * (information + information.T), pull[columns] - followed[:, -1]
 
 
 def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: Block, odds: float) -> Belief:
