@@ -222,7 +222,7 @@ def _moduli(inversion: Inversion, body: Body, row: Row) -> list[Result]:
     objective, minimum = inversion.objective, inversion.minimum
     errors = [[np.zeros(len(line.weights)) for line in minimum.evaluation.linearisations]] * NO_GRID
     bonded = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
-    covariance, posteriors = stated_posteriors(inversion, bonded)
+    covariance, posteriors = stated_posteriors(inversion, bonded, body.settings.bounds)
     known = intervals_of(inversion, body.settings, posteriors)
     without = intervals_of(inversion, body.settings, posteriors[:1])
     estimates = estimates_of(inversion, known, covariance, truth={})

@@ -15,7 +15,7 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
 from palpate.study.samples import draw_moduli
-from palpate.study.together import StatedPosterior
+from palpate.study.stated_posterior import StatedPosterior
 from palpate.study.verdicts import estimates_of, hull, intervals_of, verdict
 from palpate.uncertainty import (
     FittedState,

@@ -22,7 +22,8 @@ from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.observation.surface_distance import surface_distance
 from palpate.phantoms.scene import Scene
 from palpate.study.discrepancy import discrepancy_findings, discrepancy_of, fitted_materials
-from palpate.study.estimation import Observed, conclude, stated_posteriors
+from palpate.study.estimation import Observed, conclude
+from palpate.study.stated_posterior import stated_posteriors
 from palpate.uncertainty import FittedState
 from palpate.unknowns import layer_blocks, parameter_map, unit_blocks
 from palpate_validation.truth import exact_target
@@ -126,7 +127,7 @@ def test_an_interval_holds_the_organ_in_its_layer(sheathed, twin, twins):
         assert estimate.verdict == "identified"
     gland, sac = (estimate.variance_shares["layer"] for estimate in result.estimates)
     assert gland > sac > 0.0
-    _, posteriors = stated_posteriors(inversion, result.covariance)
+    _, posteriors = stated_posteriors(inversion, result.covariance, twins.settings(2.0).bounds)
     assert len(posteriors) == 1
 
 

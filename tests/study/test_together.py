@@ -12,7 +12,8 @@ from palpate.inversion import fixed_correspondence, invert
 from palpate.inversion.objective import Evaluation
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimate_findings import pair_findings
-from palpate.study.together import ImagePairs, PairAlone, StatedPosterior, combinations_of, image_pairs_of, regions_of
+from palpate.study.stated_posterior import StatedPosterior
+from palpate.study.together import ImagePairs, PairAlone, combinations_of, image_pairs_of, regions_of
 from palpate.uncertainty import sandwich_covariance
 
 NOISE = NoiseModel(np.array([0.1**2]), np.array([3.0]))

@@ -83,8 +83,9 @@ class ReducedBasis:
         direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
         ratios, stale = at.moduli / near.moduli, at.directions is not None and self._stale(at.moduli)
         many = stale and model.material.n_modes > MANY
+        far = FAR if at.directions is not None else FAR**2  # a single right-hand side is worth none so soon
         # solutions that iterate themselves help none; many right-hand sides are worth a factorisation of their own
-        if many or not direct or ratios.max() >= FAR * ratios.min():
+        if many or not direct or ratios.max() >= far * ratios.min():
             near = model.system(at.moduli)
             sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=1))
         matrix = weighted_sum(at.moduli, model.free_stiffness)

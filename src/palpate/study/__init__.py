@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from palpate.study.edge_length import edge_length_of as edge_length_of
     from palpate.study.estimation import Observed as Observed
     from palpate.study.estimation import conclude as conclude
-    from palpate.study.estimation import stated_posteriors as stated_posteriors
     from palpate.study.imaged import ImagedStates as ImagedStates
     from palpate.study.imaged import aligned as aligned
     from palpate.study.lock import held_folder as held_folder
@@ -44,6 +43,7 @@ if TYPE_CHECKING:
     from palpate.study.run import fitted_states as fitted_states
     from palpate.study.run import inversion_settings as inversion_settings
     from palpate.study.simulate import filled as filled
+    from palpate.study.stated_posterior import stated_posteriors as stated_posteriors
     from palpate.study.verdicts import estimates_of as estimates_of
     from palpate.study.verdicts import intervals_of as intervals_of
     from palpate.study.verdicts import verdict as verdict

@@ -15,7 +15,6 @@ from palpate.inversion import (
     Linearisation,
     Outcome,
     StartRun,
-    frozen_posterior,
 )
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, seen_by
@@ -26,17 +25,16 @@ from palpate.study.estimated import Estimation, ForceFit, Iteration, PointFit, S
 from palpate.study.map_words import map_findings
 from palpate.study.poisson_ratios import NOT_IDENTIFIED
 from palpate.study.samples import CHAINS, draw_moduli, sample_findings
-from palpate.study.together import StatedPosterior, combinations_of, image_pairs_of, regions_of
+from palpate.study.stated_posterior import stated_posteriors
+from palpate.study.together import combinations_of, image_pairs_of, regions_of
 from palpate.study.verdicts import IDENTIFIED, estimates_of, intervals_of, ratios_of
 from palpate.uncertainty import (
     GRID_DRAWS,
-    Covariance,
     FittedState,
     covariance_of,
     grid_errors,
     information,
     information_shares,
-    sandwich_covariance,
     stiffness_maps,
 )
 
@@ -69,7 +67,7 @@ def conclude(
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
     errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
     bonded = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
-    covariance, posteriors = stated_posteriors(inversion, bonded)
+    covariance, posteriors = stated_posteriors(inversion, bonded, settings.bounds)
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors)
     known = intervals_of(inversion, settings, posteriors)
@@ -124,23 +122,6 @@ def conclude(
         maps=maps,
         materials=fitted_materials(inversion),
     )
-
-
-def stated_posteriors(inversion: Inversion, bonded: Covariance) -> tuple[Covariance, tuple[StatedPosterior, ...]]:
-    """All that is stated rests on these: the covariance by all causes, and the posteriors, the widest last.
-
-    The first is that of the estimate, with its own covariance (`bonded`, where blocks are held that may be free); the
-    other, where such blocks were released, is about the minimum with them free, and has what they add.
-    """
-    objective, minimum = inversion.objective, inversion.minimum
-    fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
-    first = StatedPosterior(fixed, minimum, bonded.total)
-    if (released := inversion.released) is None:
-        return bonded, (first,)
-    sandwich = sandwich_covariance(released.objective, released.minimum.evaluation)
-    covariance = bonded.with_released(objective, minimum.evaluation, sandwich)
-    free = frozen_posterior(released.objective, released.minimum.unknowns, released.minimum.evaluation)
-    return covariance, (first, StatedPosterior(free, released.minimum, covariance.total))
 
 
 def _reason(inversion: Inversion) -> str:

@@ -14,7 +14,7 @@ from palpate.errors import ResourceError
 from palpate.findings import Finding
 from palpate.inversion import Bounds
 from palpate.study.case import SAMPLES, Case
-from palpate.study.together import StatedPosterior
+from palpate.study.stated_posterior import StatedPosterior
 from palpate.uncertainty import (
     ChainDiagnostics,
     Interval,

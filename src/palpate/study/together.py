@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from palpate.inversion import Bounds, FrozenPosterior, Inversion, LeastSquares, Minimum
+from palpate.inversion import Bounds, Inversion, LeastSquares
 from palpate.parallel import mapped
+from palpate.study.stated_posterior import StatedPosterior
 from palpate.uncertainty import (
     NORMAL_95,
     Combination,
@@ -25,15 +26,6 @@ from palpate.uncertainty import (
 )
 
 MOST_REGIONS = 3  # of the pairs of moduli that are correlated most
-
-
-@dataclass(frozen=True, slots=True)
-class StatedPosterior:
-    """One that is stated: frozen, its minimum, and the covariance (n, n) of its parameters by all that is known."""
-
-    frozen: FrozenPosterior
-    minimum: Minimum
-    covariance: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from palpate.inversion import Inversion, InversionSettings, as_good
 from palpate.parallel import mapped
 from palpate.study.estimated import ModulusEstimate, no_estimate
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
-from palpate.study.together import StatedPosterior
+from palpate.study.stated_posterior import StatedPosterior
 from palpate.uncertainty import NORMAL_95, Covariance, Interval, ModulusInterval, log_interval, modulus_interval
 from palpate.unknowns import KNOWN_MODULUS, ratio_of_eta
 

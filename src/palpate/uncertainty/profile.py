@@ -48,13 +48,14 @@ class Profile:
     r^2 = 2 (min J(theta) - min J) / s with the ratio s of its variance to that of the Gauss-Newton matrix: what is
     known of correlated residuals and of the voxels' place counts as in the ellipse, at whose ends r = 1.96 where J is a
     parabola. low, high: ln E where |r| is the level; None where the search's bound, or what cannot be solved, is
-    reached before.
+    reached before. outermost: all unknowns (n_unknowns,) at the last place on each side that has one.
     """
 
     theta: NDArray[np.float64]
     root: NDArray[np.float64]
     low: float | None
     high: float | None
+    outermost: tuple[NDArray[np.float64], ...] = ()
 
 
 def profile(
@@ -68,14 +69,19 @@ def profile(
     least = gauss_newton(fixed, minimum.unknowns, bounds=bounds, tolerance=1e-6)
     scale = float(least.evaluation.covariance_columns(number + 1)[number, number]) / variance
     held, centre = np.arange(fixed.n_parameters) == number, float(least.unknowns[number])
-    points, ends = [(centre, 0.0)], list[float | None]()
+    points, ends, outermost = [(centre, 0.0)], list[float | None](), list[NDArray[np.float64]]()
     for sign in (-1.0, 1.0):
         ray = Ray(fixed, least, sign * held, held, bounds, scale)
         found, end = ray.to_level(level, first=level * float(np.sqrt(variance)))
-        points += [(centre + sign * distance, sign * root) for distance, root in found]
+        points += [(centre + sign * distance, sign * root) for distance, root, _ in found]
+        outermost += [unknowns for _, _, unknowns in found[-1:]]
         ends.append(None if end is None else centre + sign * end)
     ordered = np.array(sorted(points))
-    return Profile(ordered[:, 0], ordered[:, 1], ends[0], ends[1])
+    return Profile(ordered[:, 0], ordered[:, 1], ends[0], ends[1], tuple(outermost))
+
+
+RayPoint = tuple[float, float, NDArray[np.float64]]
+"""Distance on a ray, root deviance r there, and all unknowns (n_unknowns,) at their best."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,8 +129,8 @@ class Ray:
             start = found.unknowns
         return found
 
-    def to_level(self, level: float, *, first: float) -> tuple[list[tuple[float, float]], float | None]:
-        """Points (distance, r) on the ray, from the `first` distance on, and where r is the level; None at the bound.
+    def to_level(self, level: float, *, first: float) -> tuple[list[RayPoint], float | None]:
+        """Points on the ray, from the `first` distance on, and the distance where r is the level; None at the bound.
 
         The root deviance is nearly straight: the next point is where a line through the minimum and the last one, or
         through the last two around the level, meets it. A place at which the model cannot be solved ends the search as
@@ -133,7 +139,7 @@ class Ray:
         held, nothing is known of any end.
         """
         bound, n = self.bound, len(self.direction)
-        least, points, inside, outside = self.least.unknowns, list[tuple[float, float]](), (0.0, 0.0), None
+        least, points, inside, outside = self.least.unknowns, list[RayPoint](), (0.0, 0.0), None
         distance = first
         if bound <= 0.0 or not self.least.converged:
             return [], None
@@ -150,7 +156,7 @@ class Ray:
             root = float(np.sqrt(max(deviance, 0.0)))
             if not (found.converged or root < (1.0 - NEAR) * level):
                 return points, None
-            points.append((distance, root))
+            points.append((distance, root, found.unknowns))
             slope = (found.unknowns - least) / distance
             if abs(root - level) < NEAR * level:
                 return points, distance * level / root
@@ -230,7 +236,7 @@ def joint_region(
         direction[pair] = along
         ray = Ray(fixed, least, direction, held, bounds, 1.0 / float(along @ np.linalg.solve(own, along)))
         points, end = ray.to_level(JOINT_LEVEL, first=JOINT_LEVEL)
-        reached = end if end is not None else max((distance for distance, _ in points), default=0.0)
+        reached = end if end is not None else max((distance for distance, *_ in points), default=0.0)
         cut = cut or end is None
         edge.append(centre + reached * along)
     return JointRegion(numbers, np.array(edge), centre + JOINT_LEVEL * directions, cut)
