@@ -1,0 +1,78 @@
+"""What is stated rests on posteriors whose models are exact as far as intervals go."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.approximation import exact_approximation, reduced_basis
+from palpate.inversion import Outcome, frozen_posterior, invert
+from palpate.observation.noise_model import NoiseModel
+from palpate.study.stated_posterior import StatedPosterior, exact_at_ends
+from palpate.uncertainty import NORMAL_95, modulus_interval
+
+NOISE = NoiseModel(np.array([0.3**2]), np.array([3.0]))
+
+
+@pytest.fixture(scope="module")
+def bounds(twins):
+    return twins.settings(2.0).bounds
+
+
+@pytest.fixture(scope="module")
+def inversion(twins, twin):
+    return invert(twins.exact_problem(twin, noise=NOISE), twins.settings(2.0), progress=twins.silent)
+
+
+@pytest.fixture(scope="module")
+def poor(inversion, twin):
+    """The objective on a basis of responses at the estimate alone, which bends little elsewhere."""
+    moduli = inversion.objective.parameters.moduli(inversion.minimum.unknowns)
+    return inversion.objective.under([reduced_basis(twin.model, moduli)])
+
+
+def posterior_of(objective, minimum):
+    covariance = np.linalg.inv(minimum.evaluation.matrix)
+    return StatedPosterior(frozen_posterior(objective, minimum.unknowns), minimum, covariance)
+
+
+def profiles(posterior, bounds):
+    variances = np.diag(posterior.covariance)[:2]
+    found = [
+        modulus_interval(posterior.frozen, posterior.minimum, k, variance=float(variance), bounds=bounds)
+        for k, variance in enumerate(variances)
+    ]
+    return [of.profile for of in found]
+
+
+def ends(posterior, bounds):
+    return np.array([[of.low, of.high] for of in profiles(posterior, bounds)], dtype=np.float64)
+
+
+def test_profiles_end_where_those_of_the_full_model_do(inversion, poor, bounds):
+    """A tenth of the half-width off at the most; those of a basis that was not asked there are further off."""
+    before = posterior_of(poor, inversion.minimum)
+    found, full = exact_at_ends(before, poor, bounds), poor
+    for of in profiles(found, bounds):
+        for place in of.outermost:
+            at, (model,) = full.linearisation_points(place)[0], full.approximations
+            full = full.under([model.with_responses(at.moduli, at.coefficients)])
+    half = NORMAL_95 * np.sqrt(np.diag(found.covariance)[:2])[:, None]
+    truth = ends(posterior_of(full, inversion.minimum), bounds)
+    off = [np.abs(ends(of, bounds) - truth) / half for of in (before, found)]
+    assert off[0].min() > 0.1
+    assert off[1].max() < 0.1
+
+
+def test_an_expansion_is_exact_at_one_place_alone_and_stays(inversion, poor, twin, bounds):
+    before = posterior_of(poor, inversion.minimum)
+    at = poor.linearisation_points(inversion.minimum.unknowns)[0]
+    assert exact_at_ends(before, poor.under([exact_approximation(twin.model, None, at)]), bounds) is before
+
+
+def test_nothing_is_asked_where_no_minimum_was_found(inversion, poor, bounds):
+    lost = replace(inversion.minimum, outcome=Outcome.STEPS)
+    before = replace(posterior_of(poor, inversion.minimum), minimum=lost)
+    assert exact_at_ends(before, poor, bounds) is before
