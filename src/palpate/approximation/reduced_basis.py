@@ -20,12 +20,13 @@ from palpate.mesh.space import Constraint
 
 SERIES = 40  # vectors at the most
 FAR = 30.0  # spread of the moduli's ratios to the factorised ones, beyond which a new factorisation costs less
+FAR_ALONE = 300.0  # the same for a single right-hand side, of some 4 sqrt(spread) iterations
 SNAPSHOT = 1e-5  # relative residual of basis vectors: what they miss is measured at each place and added there
 DISPLACEMENT, TANGENT = 1e-4, 1e-2  # of the reduced model's error, that a correction may leave
 STALE = 0.3  # of ln E, from which on all responses to the material modes are made anew
 MANY = 128  # responses to material modes, as those of a map, that cost more by iterations than by a factor of their own
 FAR_OFF = 3e-3  # of the displacement, missing: derivatives are off by as small a share
-MAX_ITERATIONS = 60
+MAX_ITERATIONS = 120
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +84,7 @@ class ReducedBasis:
         direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
         ratios, stale = at.moduli / near.moduli, at.directions is not None and self._stale(at.moduli)
         many = stale and model.material.n_modes > MANY
-        far = FAR if at.directions is not None else FAR**2  # a single right-hand side is worth none so soon
+        far = FAR if at.directions is not None else FAR_ALONE
         # solutions that iterate themselves help none; many right-hand sides are worth a factorisation of their own
         if many or not direct or ratios.max() >= far * ratios.min():
             near = model.system(at.moduli)

@@ -67,6 +67,7 @@ def conclude(
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
     errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
     bonded = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
+    progress("intervals: the models made exact where profiles end")
     covariance, posteriors = stated_posteriors(inversion, bonded, settings.bounds)
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors)

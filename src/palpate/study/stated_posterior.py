@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.errors import SolverError
 from palpate.inversion import Bounds, FrozenPosterior, Inversion, Minimum, Objective, frozen_posterior
 from palpate.parallel import mapped
 from palpate.uncertainty import NORMAL_95, Covariance, modulus_interval, sandwich_covariance
@@ -49,8 +50,8 @@ def exact_at_ends(posterior: StatedPosterior, objective: Objective, bounds: Boun
     """A posterior whose reduced models are exact where its profiles end, far from where the estimate asked for it.
 
     The displacement is added to the basis at the outermost place of every profile, and once more where that moves by a
-    tenth of the half-width. An expansion is exact at one place alone: its posterior stays as it is. objective: that of
-    the posterior, with its models. Raises `SolverError`.
+    tenth of the half-width. An expansion is exact at one place alone: its posterior stays as it is; so does one where the
+    full model cannot be solved there. objective: that of the posterior, with its models.
     """
     if not posterior.minimum.converged or any(np.isfinite(model.trust_radius) for model in objective.approximations):
         return posterior
@@ -65,8 +66,11 @@ def exact_at_ends(posterior: StatedPosterior, objective: Objective, bounds: Boun
         }
         if not moved:
             break
-        for x in moved.values():
-            models = [model.update(at) for model, at in zip(models, objective.linearisation_points(x), strict=True)]
+        try:
+            for x in moved.values():
+                models = [model.update(at) for model, at in zip(models, objective.linearisation_points(x), strict=True)]
+        except SolverError:
+            break
         exact = frozen_posterior(objective.under(models), posterior.minimum.unknowns)
         posterior, known = replace(posterior, frozen=exact), {**known, **moved}
     return posterior
