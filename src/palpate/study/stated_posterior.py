@@ -50,7 +50,7 @@ def exact_at_ends(posterior: StatedPosterior, objective: Objective, bounds: Boun
     """A posterior whose reduced models are exact where its profiles end, far from where the estimate asked for it.
 
     The displacement is added to the basis at the outermost place of every profile, and once more where that moves by a
-    tenth of the half-width. An expansion is exact at one place alone: its posterior stays as it is; so does one where the
+    tenth of the half-width. An expansion is exact at one place alone: its posterior stays as it is; so does one whose
     full model cannot be solved there. objective: that of the posterior, with its models.
     """
     if not posterior.minimum.converged or any(np.isfinite(model.trust_radius) for model in objective.approximations):
