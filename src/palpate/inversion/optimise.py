@@ -61,8 +61,8 @@ class Bounds:
         """Which of theta (n_parameters,) lie at a bound: what holds them there is the search, not the images."""
         return np.asarray((theta <= self.lower) | (theta >= self.upper))
 
-    def fixed(self, theta: NDArray[np.float64], which: NDArray[np.bool_] | bool = True) -> Bounds:
-        """Those between which the log-moduli `which` (n_parameters,), or all, keep the values theta (n_parameters,)."""
+    def fixed(self, theta: NDArray[np.float64], which: NDArray[np.bool_]) -> Bounds:
+        """Those between which the log-moduli `which` (n_parameters,) keep their values theta (n_parameters,)."""
         return Bounds(np.where(which, theta, self.lower), np.where(which, theta, self.upper))
 
     def free(self, unknowns: NDArray[np.float64], score: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -13,7 +13,7 @@ from palpate.inversion import Bounds, FrozenPosterior, Inversion, Minimum, Objec
 from palpate.parallel import mapped
 from palpate.uncertainty import NORMAL_95, Covariance, modulus_interval, sandwich_covariance
 
-ROUNDS = 3  # of models made exact where profiles end; after one an end is off by 0.06 of ln E (docs/method.md)
+ROUNDS = 3  # of models made exact where profiles end, the most
 STAYS = 0.1  # of the half-width, by which an end may still move
 
 
