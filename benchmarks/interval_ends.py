@@ -31,12 +31,12 @@ def main() -> int:
     """Measure every seed and print how far the ends are off."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", default="401,402,403")
-    parser.add_argument("--edge", type=float, help="edge length (mm) instead of the row's own")
+    parser.add_argument("--edge", type=float, default=ROWS["clean"].edge_mm, help="edge length, mm")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     arguments = parser.parse_args()
     found = []
     for seed in map(int, arguments.seeds.split(",")):
-        found.append(measured(seed, arguments.edge or ROWS["clean"].edge_mm))
+        found.append(measured(seed, arguments.edge))
         if not arguments.json:
             for basis in ("as the estimate left it", "exact at the ends"):
                 off = ", ".join("open" if np.isnan(end) else f"{end:.3f}" for end in found[-1][basis])
