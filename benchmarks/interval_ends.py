@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from palpate.approximation import ReducedBasis
 from palpate.inversion import Bounds, Objective, frozen_posterior, invert
-from palpate.study import stated_posteriors
-from palpate.study.stated_posterior import StatedPosterior
+from palpate.study import StatedPosterior, stated_posteriors
 from palpate.uncertainty import Profile, covariance_of, modulus_interval
 
 NO_GRID = 3  # draws of a voxel grid, in which nothing is off
