@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inversion import LaterState, invert, posterior_sd
+from palpate.inversion import LaterState, first_noise_of, invert, posterior_sd
 from palpate.inversion import informed_subspace as informed
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.material import material_modes
@@ -44,6 +44,24 @@ def test_estimates_with_what_is_seen_are_those_with_all_unknowns(twins, patchy):
     sd = posterior_sd(whole.minimum, 2)
     assert seen.minimum.unknowns[:2] == pytest.approx(whole.minimum.unknowns[:2], abs=0.1 * sd.min())
     assert posterior_sd(seen.minimum, 2) == pytest.approx(sd, rel=0.03)
+
+
+def test_what_is_seen_is_asked_at_one_place_wherever_an_estimate_starts(twins, patchy):
+    """At the middle of the bounds: two sets of starts are two ways through one problem."""
+    every = [twins.settings(*ratios) for ratios in ((0.2, 0.5, 3.0), (1.0, 9.0, 30.0))]
+    found = [first_noise_of(patchy, settings, progress=twins.silent)[0] for settings in every]
+    kept = [[term for b in each.parameters.blocks for of in b.alternatives for term in of] for each in found]
+    assert all(np.array_equal(one, other) for one, other in zip(*kept, strict=True))
+    responses = [each.approximations[0].model.stiffness for each in found]
+    n = found[0].states[0].model.constraint.n_modes + 1
+    assert np.array_equal(*(of[:, :n, :n] for of in responses))
+
+
+@pytest.mark.parametrize(("ratios", "place"), [((0.5, 8.0), 2.0), ((3.0, 8.0), 3.0), ((0.1, 0.4), 0.4)])
+def test_that_place_is_no_further_than_the_starts_lie(twins, patchy, ratios, place):
+    """Bounds say where nothing is sought, not where an estimate may be."""
+    n = patchy.parameters.n_parameters
+    assert twins.settings(*ratios).centre(patchy)[:n] == pytest.approx(np.log(place))
 
 
 def test_what_is_left_out_could_explain_less_than_it_may(rng):

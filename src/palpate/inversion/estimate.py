@@ -28,6 +28,7 @@ from palpate.inversion.trust_region import (
     OuterIterate,
     StopRule,
     begun,
+    fit_coefficients,
     minimised,
     total_counted_as,
     with_fewest,
@@ -60,6 +61,12 @@ class InversionSettings:
         theta = np.median(np.stack(self.starts), axis=0)
         return np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
 
+    def centre(self, problem: InverseProblem) -> NDArray[np.float64]:
+        """Those at the middle of the bounds, or at the end of the range of the `starts` that is nearest to it."""
+        starts, theta = np.stack(self.starts), 0.5 * (self.bounds.lower + self.bounds.upper)
+        theta = np.clip(theta, starts.min(axis=0), starts.max(axis=0))
+        return np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
+
 
 @blas_on_one_thread()
 def invert(
@@ -78,12 +85,12 @@ def invert(
             "a Poisson's ratio can be sought under the linear law only: the finite-strain models hold those of the"
             " tissues; seek none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
         )
-    begin = settings.middle(problem)
     last = None if problem.finite_strain else rule
     if any(state.approximation is None for state in problem.states):
-        linear = [_linear(*_with_reduced_bases(problem, begin, progress), settings, last, progress)]
+        linear = [_linear(*_with_reduced_bases(problem, settings, progress), settings, last, progress)]
     else:
-        linear = [_linear(Objective(problem.states, problem.parameters), begin, 0, settings, last, progress)]
+        objective = Objective(problem.states, problem.parameters)
+        linear = [_linear(objective, settings.middle(problem), 0, settings, last, progress)]
     if not problem.finite_strain:
         return with_released(linear[0], settings, progress=progress, rule=rule)
     there = during("finite strain", progress)
@@ -100,7 +107,7 @@ def first_noise_of(
     Its minimum is near the middle start, and no estimate: no other start and no exact derivative was tried. Raises as
     `invert` does.
     """
-    objective, unknowns, _ = _with_reduced_bases(problem.linear(), settings.middle(problem), progress)
+    objective, unknowns, _ = _with_reduced_bases(problem.linear(), settings, progress)
     objective = with_first_noise(objective).rematched(np.zeros(objective.parameters.n_unknowns))
     nearby = minimised(begun(objective, unknowns), settings.bounds, NEAR, progress=progress, title="the middle start")
     return nearby.objective, nearby.minimum
@@ -189,19 +196,25 @@ def _followed(inversion: Inversion, before: OuterIterate, free: OuterIterate, en
 
 
 def _with_reduced_bases(
-    problem: InverseProblem, begin: NDArray[np.float64], progress: Progress
+    problem: InverseProblem, settings: InversionSettings, progress: Progress
 ) -> tuple[Objective, NDArray[np.float64], int]:
-    """The objective on reduced bases, unknowns `begin` (n_unknowns,) with the drivers' motion fitted, what it cost.
+    """The objective on reduced bases, unknowns (n_unknowns,) at the middle start, the motion fitted, what it cost.
 
-    Its blocks hold what the images tell of those of the problem.
+    Its blocks hold what the images tell of those of the problem, asked where no start decides (see `centre`): of two
+    sets of starts each would else have a problem of its own.
     """
-    informed = informed_problem(problem, begin, progress=progress)
+    informed = informed_problem(problem, settings.centre(problem), progress=progress)
     parameters, unknowns = informed.problem.parameters, informed.unknowns
     progress(f"how the responses to {parameters.n_coefficients} unknowns that are seen change with the moduli")
     by_theta, coefficients = parameters.derivatives(unknowns), parameters.coefficients(unknowns)
     triples = zip(informed.problem.states, informed.bases, coefficients, strict=True)
     states = tuple(state.with_approximation(basis.with_modulus_series(q, by_theta)) for state, basis, q in triples)
-    return Objective(states, parameters), unknowns, informed.evaluations
+    objective, theta = Objective(states, parameters), settings.middle(problem)[: parameters.n_parameters]
+    if np.allclose(theta, unknowns[: len(theta)]):
+        return objective, unknowns, informed.evaluations
+    start = np.concatenate([theta, unknowns[len(theta) :]])
+    fitted = fit_coefficients(with_first_noise(objective).rematched(np.zeros_like(start)), start)
+    return objective, fitted.unknowns, informed.evaluations + fitted.evaluations
 
 
 def _linear(
