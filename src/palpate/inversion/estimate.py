@@ -74,7 +74,7 @@ def invert(
 ) -> Inversion:
     """Estimate log-moduli and drivers' motion together, from all starts, with the linear law first.
 
-    States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle start
+    States that bring an approximation are estimated on it; for the others a reduced basis is made amid the bounds
     and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows ends near.
     At last blocks that were fixed are released, see `with_released`.
     Raises `ConfigurationError` for an unknown Poisson's ratio with another law, `EstimationError`s of solving; an

@@ -29,7 +29,7 @@ from palpate.unknowns.blocks import Acts, Block
 class InformedProblem:
     """An inverse problem on the combinations that are seen, with each state's reduced basis of them.
 
-    unknowns (n_unknowns,): the middle start, with the boundary's motion fitted; evaluations: what that cost.
+    unknowns (n_unknowns,): where that was asked, with the boundary's motion fitted; evaluations: what that cost.
     """
 
     problem: InverseProblem
@@ -48,11 +48,11 @@ def informed_problem(problem: InverseProblem, begin: NDArray[np.float64], *, pro
     """
     parameters, states, found = problem.parameters, list[LaterState](), list[_Responses]()
     for number, state in enumerate(problem.states, start=1):
-        progress(f"responses of the full model at the middle start, state {number} of {len(problem.states)}")
+        progress(f"responses of the full model amid the bounds, state {number} of {len(problem.states)}")
         system = state.model.system(parameters.moduli(begin))
         found.append(_Responses(system, system.single_responses(tolerance=SNAPSHOT)))
         states.append(replace(state, observed=found[-1].seen(state, np.zeros(state.model.n_modes))))
-    progress("the motion of walls and frame at the middle start")
+    progress("the motion of walls and frame there")
     objective = with_first_noise(Objective(tuple(states), parameters)).rematched(begin)
     fitted = fit_coefficients(objective, begin)
     progress("what the images tell of all unknowns there")
