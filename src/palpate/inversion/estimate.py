@@ -62,7 +62,7 @@ class InversionSettings:
         return np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
 
     def centre(self, problem: InverseProblem) -> NDArray[np.float64]:
-        """Those at the middle of the bounds, or at the end of the range of the `starts` that is nearest to it."""
+        """Unknowns (n_unknowns,) at the middle of the bounds, or at the end of the starts' range nearest to it."""
         starts, theta = np.stack(self.starts), 0.5 * (self.bounds.lower + self.bounds.upper)
         theta = np.clip(theta, starts.min(axis=0), starts.max(axis=0))
         return np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
@@ -74,8 +74,8 @@ def invert(
 ) -> Inversion:
     """Estimate log-moduli and drivers' motion together, from all starts, with the linear law first.
 
-    States that bring an approximation are estimated on it; for the others a reduced basis is made amid the bounds
-    and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows ends near.
+    States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle of the
+    bounds and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows ends near.
     At last blocks that were fixed are released, see `with_released`.
     Raises `ConfigurationError` for an unknown Poisson's ratio with another law, `EstimationError`s of solving; an
     estimate that did not converge says so in its minimum's outcome.

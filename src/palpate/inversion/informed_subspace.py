@@ -48,7 +48,7 @@ def informed_problem(problem: InverseProblem, begin: NDArray[np.float64], *, pro
     """
     parameters, states, found = problem.parameters, list[LaterState](), list[_Responses]()
     for number, state in enumerate(problem.states, start=1):
-        progress(f"responses of the full model amid the bounds, state {number} of {len(problem.states)}")
+        progress(f"responses of the full model at the bounds' middle, state {number} of {len(problem.states)}")
         system = state.model.system(parameters.moduli(begin))
         found.append(_Responses(system, system.single_responses(tolerance=SNAPSHOT)))
         states.append(replace(state, observed=found[-1].seen(state, np.zeros(state.model.n_modes))))
