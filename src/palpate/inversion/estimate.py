@@ -75,8 +75,8 @@ def invert(
     """Estimate log-moduli and drivers' motion together, from all starts, with the linear law first.
 
     States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle of the
-    bounds and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows ends near.
-    At last blocks that were fixed are released, see `with_released`.
+    bounds and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows
+    ends near. At last blocks that were fixed are released, see `with_released`.
     Raises `ConfigurationError` for an unknown Poisson's ratio with another law, `EstimationError`s of solving; an
     estimate that did not converge says so in its minimum's outcome.
     """
