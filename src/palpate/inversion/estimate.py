@@ -89,7 +89,7 @@ def invert(
     if any(state.approximation is None for state in problem.states):
         linear = [_linear(*_with_reduced_bases(problem, settings, progress), settings, last, progress)]
     else:
-        objective = Objective(problem.states, problem.parameters)
+        objective = _at_rest(Objective(problem.states, problem.parameters))
         linear = [_linear(objective, settings.middle(problem), 0, settings, last, progress)]
     if not problem.finite_strain:
         return with_released(linear[0], settings, progress=progress, rule=rule)
@@ -108,7 +108,6 @@ def first_noise_of(
     `invert` does.
     """
     objective, unknowns, _ = _with_reduced_bases(problem.linear(), settings, progress)
-    objective = with_first_noise(objective).rematched(np.zeros(objective.parameters.n_unknowns))
     nearby = minimised(begun(objective, unknowns), settings.bounds, NEAR, progress=progress, title="the middle start")
     return nearby.objective, nearby.minimum
 
@@ -209,12 +208,16 @@ def _with_reduced_bases(
     by_theta, coefficients = parameters.derivatives(unknowns), parameters.coefficients(unknowns)
     triples = zip(informed.problem.states, informed.bases, coefficients, strict=True)
     states = tuple(state.with_approximation(basis.with_modulus_series(q, by_theta)) for state, basis, q in triples)
-    objective, theta = Objective(states, parameters), settings.middle(problem)[: parameters.n_parameters]
+    objective, theta = _at_rest(Objective(states, parameters)), settings.middle(problem)[: parameters.n_parameters]
     if np.allclose(theta, unknowns[: len(theta)]):
         return objective, unknowns, informed.evaluations
-    start = np.concatenate([theta, unknowns[len(theta) :]])
-    fitted = fit_coefficients(with_first_noise(objective).rematched(np.zeros_like(start)), start)
+    fitted = fit_coefficients(objective, np.concatenate([theta, unknowns[len(theta) :]]))
     return objective, fitted.unknowns, informed.evaluations + fitted.evaluations
+
+
+def _at_rest(objective: Objective) -> Objective:
+    """The objective before any residual is seen, with what belongs together where nothing has moved."""
+    return with_first_noise(objective).rematched(np.zeros(objective.parameters.n_unknowns))
 
 
 def _linear(
@@ -227,12 +230,11 @@ def _linear(
 ) -> Inversion:
     """The estimate of the linear law: every start on the cheap model, the best ones followed to their ends.
 
-    rule: of these; None: they end near, as the start of another law. begin (n_unknowns,): the middle start, with the
-    blocks' coefficients near the best ones there, and what it cost to find them in evaluations.
+    objective: as it is at rest; rule: of the starts that are followed, None: they end near, as the start of another
+    law. begin (n_unknowns,): the middle start, with the blocks' coefficients near the best ones there, and what it cost
+    to find them in evaluations.
     """
-    still, n, bounds = np.zeros(objective.parameters.n_unknowns), objective.n_parameters, settings.bounds
-    objective = with_first_noise(objective).rematched(still)
-    rest = objective(still)
+    n, bounds, rest = objective.n_parameters, settings.bounds, objective(np.zeros(objective.parameters.n_unknowns))
     first = minimised(begun(objective, begin), bounds, NEAR, progress=progress, title="the middle start")
     screened = _screened(first, settings, progress)
     groups = grouped(screened, n)
