@@ -3,7 +3,7 @@
     python benchmarks/answers.py [--rows clean,noise,...] [--cases N] [--first-seed S] [--output FILE] [--json]
 
 For each case two estimates from the same images, by one and the same outer loop. One is the product's. The plain one
-knows no reduced model, no frozen factor and no derivative that is not exact: it starts at the middle start alone, and
+knows no reduced model, no frozen factor and no derivative that is not exact: it starts at one place, and
 the full model is solved, factorised and differentiated by all moduli and modes wherever the loop leads. It ends at a
 fifth of what the product may leave open. At finite strain it goes on from its own linear estimate. Simulated data.
 
@@ -106,8 +106,8 @@ def _both(case: Posed) -> Result:
 def plain_estimate(
     problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]
 ) -> OuterIterate:
-    """The estimate from the middle start, the full model solved with all its derivatives at every place."""
-    still, bounds = settings.middle(problem), settings.bounds
+    """The estimate from where the program begins, the full model solved with all its derivatives at every place."""
+    still, bounds = settings.centre(problem), settings.bounds
     objective = with_first_noise(_exact(Objective(problem.states, problem.parameters), still)).rematched(still)
     filled = fit_coefficients(objective, still)
     start = begun(_exact(objective, filled.unknowns), filled.unknowns)  # at rest no modulus shows

@@ -15,7 +15,7 @@ from palpate.inversion import (
     Outcome,
     StartRun,
     begun,
-    estimate,
+    candidates,
     invert,
     minimised,
     posterior_sd,
@@ -265,7 +265,7 @@ def test_starts_that_lead_elsewhere_are_followed_the_best_first_and_others_say_t
     twins, voxels, monkeypatch
 ):
     """Four minima of the cheapest model, told to lie apart: the first one's, two that are followed, one that is not."""
-    screened = estimate._screened
+    screened = candidates._screened
 
     def apart(first, settings, progress):
         here, *_ = screened(first, settings, progress)
@@ -273,14 +273,14 @@ def test_starts_that_lead_elsewhere_are_followed_the_best_first_and_others_say_t
         values = [replace(here.evaluation, value=here.evaluation.value + k) for k in (0.0, 2.0, 1.0, 3.0)]
         return [replace(here, unknowns=here.unknowns + w, evaluation=v) for w, v in zip(ways, values, strict=True)]
 
-    followed, follow = [], estimate.minimised
+    followed, follow = [], candidates.minimised
 
     def noted(start, *of, **named):
         followed.append((named["title"], start.minimum.unknowns[:2]))
         return follow(start, *of, **named)
 
-    monkeypatch.setattr(estimate, "_screened", apart)
-    monkeypatch.setattr(estimate, "minimised", noted)
+    monkeypatch.setattr(candidates, "_screened", apart)
+    monkeypatch.setattr(candidates, "minimised", noted)
     found = invert(voxels, twins.settings(0.5, 1.0, 2.0, 4.0), progress=twins.silent)
     assert [title for title, _ in followed if title.startswith("start")] == ["start 3", "start 2"]
     assert [start.candidate for start in found.starts] == [0, 0, 0, None]

@@ -57,6 +57,15 @@ def test_what_is_seen_is_asked_at_one_place_wherever_an_estimate_starts(twins, p
     assert np.array_equal(*(of[:, :n, :n] for of in responses))
 
 
+def test_starts_about_that_place_are_judged_from_one_minimum(twins, patchy):
+    """Which they are moves no estimate, as long as they lead to the same minimum."""
+    every = [twins.settings(*ratios) for ratios in ((0.2, 0.5, 3.0), (1.0, 9.0, 30.0), (2.0,))]
+    found = [invert(patchy, settings, progress=twins.silent) for settings in every]
+    assert all(len(each.candidates) == 1 for each in found)
+    assert all(each.minimum.unknowns == pytest.approx(found[0].minimum.unknowns, abs=1e-7) for each in found)
+    assert [len(each.starts) for each in found] == [3, 3, 1]
+
+
 @pytest.mark.parametrize(("ratios", "place"), [((0.5, 8.0), 2.0), ((3.0, 8.0), 3.0), ((0.1, 0.4), 0.4)])
 def test_that_place_is_no_further_than_the_starts_lie(twins, patchy, ratios, place):
     """Bounds say where nothing is sought, not where an estimate may be."""

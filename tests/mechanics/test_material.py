@@ -194,6 +194,24 @@ def test_responses_to_the_material_are_made_anew_far_away_without_another_factor
     assert np.all(np.linalg.norm(found - exact, axis=0) < 0.005 * np.linalg.norm(exact, axis=0))
 
 
+def test_far_away_what_decides_is_exact_where_no_response_to_every_material_mode_is_asked_for(
+    body, modes, coefficients, rng
+):
+    """Those of the directions alone, at the material's coefficients there."""
+    model, every = linear_model(*body, material=modes), np.concatenate(coefficients)
+    first = reduced_basis(model, MODULI)
+    first = first.with_material(first.system.material_responses(model.solve(MODULI, every).values), MODULI)
+    moduli, n, boundary = MODULI * [2.0, 1.0], model.n_regions + len(every), model.n_regions + body[1].n_modes
+    directions = rng.normal(size=(n, 2))
+    basis = first.update(LinearisationPoint(moduli, every, directions, np.eye(n), every=False))
+    homogeneous = np.concatenate([coefficients[0], 0.0 * coefficients[1]])
+    along = [
+        of.solve(moduli, homogeneous).tangent()[:, boundary:] @ directions[boundary:] for of in (model, basis.model)
+    ]
+    assert np.array_equal(basis.material_at, MODULI)
+    assert np.linalg.norm(along[1] - along[0]) < 0.02 * np.linalg.norm(along[0])
+
+
 @pytest.mark.parametrize("dilatation", list(Dilatation))
 def test_the_linear_law_is_the_small_strain_limit_of_a_patchy_body(body, modes, coefficients, dilatation):
     """To first order in the material: a hundredth of the motion and of the modes, derivatives and all."""

@@ -46,13 +46,15 @@ class LinearisationPoint:
     """Moduli (n_regions,) kPa and driver coefficients (n_modes,) at which a model is approximated.
 
     directions (n_regions + n_modes, k) of (ln E, q): those along which derivatives are made exact, None where the
-    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there.
+    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there; every:
+    whether they are made so along all material modes, too, where these are known of far moduli.
     """
 
     moduli: NDArray[np.float64]
     coefficients: NDArray[np.float64]
     directions: NDArray[np.float64] | None = None
     metric: NDArray[np.float64] | None = None
+    every: bool = True
 
     def same_as(self, other: LinearisationPoint | None) -> bool:
         """Whether moduli and coefficients are those of another place."""

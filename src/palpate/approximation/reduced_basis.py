@@ -82,7 +82,7 @@ class ReducedBasis:
         """
         model, near, sharper = self.full_model, self.system, self
         direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
-        ratios, stale = at.moduli / near.moduli, at.directions is not None and self._stale(at.moduli)
+        ratios, stale = at.moduli / near.moduli, at.directions is not None and self._stale(at)
         many = stale and model.material.n_modes > MANY
         far = FAR if at.directions is not None else FAR_ALONE
         # solutions that iterate themselves help none; many right-hand sides are worth a factorisation of their own
@@ -143,11 +143,11 @@ class ReducedBasis:
         """With the responses (n_dof, n_material) mm to the material modes at moduli (n_regions,) kPa."""
         return replace(self, projection=self.projection.with_material(responses), material_at=moduli)
 
-    def _stale(self, moduli: NDArray[np.float64]) -> bool:
-        """Whether responses to the material modes are not there yet, or of far from moduli (n_regions,) kPa."""
-        if not self.full_model.material.n_modes:
-            return False
-        return not len(self.material_at) or bool(np.abs(np.log(moduli / self.material_at)).max() > STALE)
+    def _stale(self, at: LinearisationPoint) -> bool:
+        """Whether responses to the material modes are not there yet, or of far from a place that asks for them all."""
+        if not self.full_model.material.n_modes or not len(self.material_at):
+            return bool(self.full_model.material.n_modes)
+        return at.every and bool(np.abs(np.log(at.moduli / self.material_at)).max() > STALE)
 
     def _homogeneous(self, at: LinearisationPoint) -> NDArray[np.float64]:
         """The displacement (n_dof,) mm at a place as it would be of homogeneous tissues."""

@@ -1,4 +1,4 @@
-"""The distinct minima that the starts lead to, and which of them is the best under one objective."""
+"""From starts to the distinct minima that they lead to, and which of them is the best under one objective."""
 
 from __future__ import annotations
 
@@ -8,13 +8,39 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.inversion.frozen_posterior import cheapest_minima
+from palpate.inversion.later_state import InverseProblem
 from palpate.inversion.objective import AS_GOOD, Evaluation, Objective
 from palpate.inversion.optimise import Bounds, Minimum, same_minimum
-from palpate.inversion.trust_region import NEAR, Convergence, OuterIterate, begun, minimised, with_fewest
+from palpate.inversion.trust_region import NEAR, Convergence, OuterIterate, StopRule, begun, minimised, with_fewest
 from palpate.mechanics.forward import SolveCounts
-from palpate.progress import silent
+from palpate.progress import Progress, silent
 
 COMPARED = replace(NEAR, correlate=False)  # the numbers of independent residuals stay: objectives are compared
+FOLLOWED = 2  # minima of starts beside the first one, the best
+
+
+@dataclass(frozen=True, slots=True)
+class InversionSettings:
+    """Starts theta (n_parameters,) each, and their bounds; the first minimum is sought from their `centre`."""
+
+    starts: tuple[NDArray[np.float64], ...]
+    bounds: Bounds
+    further: tuple[NDArray[np.float64], ...] = ()
+
+    @property
+    def every_start(self) -> tuple[NDArray[np.float64], ...]:
+        """All starts (n_parameters,), the further ones last."""
+        return self.starts + self.further
+
+    def centre(self, problem: InverseProblem) -> NDArray[np.float64]:
+        """Unknowns (n_unknowns,) at the middle of the bounds, or at the end of the starts' range nearest to it.
+
+        Nothing else acts there. Two sets of starts about it are judged from one minimum, of one problem.
+        """
+        starts, theta = np.stack(self.starts), 0.5 * (self.bounds.lower + self.bounds.upper)
+        theta = np.clip(theta, starts.min(axis=0), starts.max(axis=0))
+        return np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +100,57 @@ class Inversion:
     def convergence(self) -> Convergence:
         """What the best minimum's last outer iteration left unmet."""
         return self.candidates[self.best].iterate.convergence
+
+
+def from_starts(
+    objective: Objective,
+    begin: NDArray[np.float64],
+    settings: InversionSettings,
+    *,
+    rule: StopRule | None,
+    progress: Progress,
+) -> Inversion:
+    """The minima that all starts lead to: each on the cheapest model, the best ones followed on the objective's own.
+
+    objective: as it is at rest; begin (n_unknowns,): where the first minimum is sought. rule: when the best one ends,
+    and others that are as good; None: all end near, as the start of another law.
+    """
+    n, bounds, rest = objective.n_parameters, settings.bounds, objective(np.zeros(objective.parameters.n_unknowns))
+    first = minimised(begun(objective, begin), bounds, NEAR, progress=progress, title="the first minimum")
+    screened = _screened(first, settings, progress)
+    ends, groups = [first], grouped(screened, n)
+    belongs = {groups[i]: 0 for i, m in enumerate(screened) if same_minimum(m.unknowns, first.minimum, n)}
+    lowest_last = sorted(range(len(screened)), key=lambda i: -screened[i].evaluation.value)
+    lowest = {groups[i]: i for i in lowest_last if groups[i] not in belongs}
+    others = [i for i in reversed(lowest_last) if i in lowest.values() and screened[i].converged]
+    for number in others[:FOLLOWED]:
+        start, belongs[groups[number]] = begun(first.objective, screened[number].unknowns), len(ends)
+        ends.append(minimised(start, bounds, COMPARED, progress=progress, title=f"start {number + 1}"))
+    pairs = zip(settings.every_start, screened, groups, strict=True)
+    starts = tuple(StartRun(theta, minimum, belongs.get(group)) for theta, minimum, group in pairs)
+    found = concluded(ends, starts, rest, bounds, 0)
+    evaluations = 1 + sum(end.minimum.evaluations for end in ends) + found.evaluations
+    counts = sum((end.counts - first.counts for end in ends[1:]), first.counts)
+    if rule is not None:
+        followed, least = list[OuterIterate](), found.candidates[found.best].value
+        for number, candidate in enumerate(found.candidates):
+            end = candidate.iterate
+            if number == found.best or (candidate.minimum.converged and as_good(candidate.value, least)):
+                end = minimised(end, bounds, rule, progress=progress, title="linear law")
+            evaluations += end.minimum.evaluations - candidate.minimum.evaluations
+            counts += end.counts - candidate.iterate.counts
+            followed.append(end)
+        found = concluded(followed, found.starts, rest, bounds, found.best)
+        evaluations += found.evaluations
+    return replace(found, evaluations=evaluations, counts=counts)
+
+
+def _screened(first: OuterIterate, settings: InversionSettings, progress: Progress) -> list[Minimum]:
+    """A minimum from every start on the cheapest model: closest points and hyper-parameters as at a first minimum."""
+    at, n = first.minimum, first.objective.n_parameters
+    progress(f"{len(settings.every_start)} starts, with the closest points of the first minimum")
+    begins = [np.concatenate([theta, at.unknowns[n:]]) for theta in settings.every_start]
+    return cheapest_minima(first.objective, at.unknowns, at.evaluation, begins, settings.bounds)
 
 
 def as_good(value: float, best: float, *, scale: float = 1.0) -> bool:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.approximation.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.errors import ConfigurationError, EstimationError, NotConverged
-from palpate.inversion.candidates import COMPARED, Inversion, StartRun, as_good, concluded, grouped, members
-from palpate.inversion.frozen_posterior import cheapest
+from palpate.inversion.candidates import Inversion, InversionSettings, concluded, from_starts
+from palpate.inversion.frozen_posterior import cheapest_minima
 from palpate.inversion.hyper_parameters import with_first_noise
 from palpate.inversion.informed_subspace import informed_problem
 from palpate.inversion.later_state import InverseProblem, LaterState
@@ -20,18 +20,14 @@ from palpate.inversion.optimise import (
     Bounds,
     Minimum,
     Outcome,
-    gauss_newton,
-    same_minimum,
 )
 from palpate.inversion.trust_region import (
     NEAR,
     OuterIterate,
     StopRule,
     begun,
-    fit_coefficients,
     minimised,
     total_counted_as,
-    with_fewest,
 )
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
@@ -39,33 +35,8 @@ from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, during
 
 REPORTED = StopRule()
-FOLLOWED = 2  # minima of starts beside the first one, the best
+ASKED = replace(NEAR, every=False)  # whether images tell of what was fixed hangs on what decides the moduli alone
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
-
-
-@dataclass(frozen=True, slots=True)
-class InversionSettings:
-    """Starts theta (n_parameters,) each, and their bounds; the first minimum is sought from the middle of `starts`."""
-
-    starts: tuple[NDArray[np.float64], ...]
-    bounds: Bounds
-    further: tuple[NDArray[np.float64], ...] = ()
-
-    @property
-    def every_start(self) -> tuple[NDArray[np.float64], ...]:
-        """All starts (n_parameters,), the further ones last."""
-        return self.starts + self.further
-
-    def middle(self, problem: InverseProblem) -> NDArray[np.float64]:
-        """Unknowns (n_unknowns,) of a problem at the middle of the `starts`, where nothing else acts."""
-        theta = np.median(np.stack(self.starts), axis=0)
-        return np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
-
-    def centre(self, problem: InverseProblem) -> NDArray[np.float64]:
-        """Unknowns (n_unknowns,) at the middle of the bounds, or at the end of the starts' range nearest to it."""
-        starts, theta = np.stack(self.starts), 0.5 * (self.bounds.lower + self.bounds.upper)
-        theta = np.clip(theta, starts.min(axis=0), starts.max(axis=0))
-        return np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
 
 
 @blas_on_one_thread()
@@ -85,16 +56,12 @@ def invert(
             "a Poisson's ratio can be sought under the linear law only: the finite-strain models hold those of the"
             " tissues; seek none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
         )
-    last = None if problem.finite_strain else rule
-    if any(state.approximation is None for state in problem.states):
-        linear = [_linear(*_with_reduced_bases(problem, settings, progress), settings, last, progress)]
-    else:
-        objective = _at_rest(Objective(problem.states, problem.parameters))
-        linear = [_linear(objective, settings.middle(problem), 0, settings, last, progress)]
     if not problem.finite_strain:
-        return with_released(linear[0], settings, progress=progress, rule=rule)
+        found = _linear(problem, settings, rule, progress)
+        return with_released(found, settings, progress=progress, rule=rule)
     there = during("finite strain", progress)
-    found = continue_at_finite_strain(linear.pop(), settings, progress=there, rule=rule)  # which lets go of its bases
+    # nothing else holds the linear minima, so that it lets go of their bases
+    found = continue_at_finite_strain(_linear(problem, settings, None, progress), settings, progress=there, rule=rule)
     return with_released(found, settings, progress=there, rule=rule)
 
 
@@ -104,11 +71,10 @@ def first_noise_of(
 ) -> tuple[Objective, Minimum]:
     """What an estimate begins with under the linear law: the objective under the noise that the images show, and where.
 
-    Its minimum is near the middle start, and no estimate: no other start and no exact derivative was tried. Raises as
-    `invert` does.
+    Its minimum is the first one, and no estimate: no start was tried. Raises as `invert` does.
     """
     objective, unknowns, _ = _with_reduced_bases(problem.linear(), settings, progress)
-    nearby = minimised(begun(objective, unknowns), settings.bounds, NEAR, progress=progress, title="the middle start")
+    nearby = minimised(begun(objective, unknowns), settings.bounds, NEAR, progress=progress, title="the first minimum")
     return nearby.objective, nearby.minimum
 
 
@@ -169,7 +135,7 @@ def with_released(
         objective = objective.under(near)
         start = begun(objective, _on_cheapest(objective, unknowns, bounds), history=before.minimum.history)
         start = replace(start, checks=before.checks)
-        end = free = minimised(start, bounds, NEAR, progress=progress, title=title)
+        end = free = minimised(start, bounds, ASKED, progress=progress, title=title)
         followed = _followed(inversion, before, free, free)
         gain = before.objective.total(before.minimum.evaluation) - total_counted_as(free, before)
         gain += min(block.released_odds for block in released)
@@ -194,25 +160,29 @@ def _followed(inversion: Inversion, before: OuterIterate, free: OuterIterate, en
     return replace(inversion, evaluations=evaluations, counts=inversion.counts + spent, released=free)
 
 
+def _linear(
+    problem: InverseProblem, settings: InversionSettings, rule: StopRule | None, progress: Progress
+) -> Inversion:
+    """The estimate of the linear law from all starts, on the states' own approximations or on reduced bases."""
+    if any(state.approximation is None for state in problem.states):
+        objective, begin, spent = _with_reduced_bases(problem, settings, progress)
+    else:
+        objective, begin, spent = _at_rest(Objective(problem.states, problem.parameters)), settings.centre(problem), 0
+    found = from_starts(objective, begin, settings, rule=rule, progress=progress)
+    return replace(found, evaluations=found.evaluations + spent)
+
+
 def _with_reduced_bases(
     problem: InverseProblem, settings: InversionSettings, progress: Progress
 ) -> tuple[Objective, NDArray[np.float64], int]:
-    """The objective on reduced bases, unknowns (n_unknowns,) at the middle start, the motion fitted, what it cost.
-
-    Its blocks hold what the images tell of those of the problem, asked where no start decides (see `centre`): of two
-    sets of starts each would else have a problem of its own.
-    """
+    """The objective on reduced bases, unknowns (n_unknowns,) at the `centre`, the motion fitted, what it cost."""
     informed = informed_problem(problem, settings.centre(problem), progress=progress)
     parameters, unknowns = informed.problem.parameters, informed.unknowns
     progress(f"how the responses to {parameters.n_coefficients} unknowns that are seen change with the moduli")
     by_theta, coefficients = parameters.derivatives(unknowns), parameters.coefficients(unknowns)
     triples = zip(informed.problem.states, informed.bases, coefficients, strict=True)
     states = tuple(state.with_approximation(basis.with_modulus_series(q, by_theta)) for state, basis, q in triples)
-    objective, theta = _at_rest(Objective(states, parameters)), settings.middle(problem)[: parameters.n_parameters]
-    if np.allclose(theta, unknowns[: len(theta)]):
-        return objective, unknowns, informed.evaluations
-    fitted = fit_coefficients(objective, np.concatenate([theta, unknowns[len(theta) :]]))
-    return objective, fitted.unknowns, informed.evaluations + fitted.evaluations
+    return _at_rest(Objective(states, parameters)), unknowns, informed.evaluations
 
 
 def _at_rest(objective: Objective) -> Objective:
@@ -220,70 +190,9 @@ def _at_rest(objective: Objective) -> Objective:
     return with_first_noise(objective).rematched(np.zeros(objective.parameters.n_unknowns))
 
 
-def _linear(
-    objective: Objective,
-    begin: NDArray[np.float64],
-    evaluations: int,
-    settings: InversionSettings,
-    rule: StopRule | None,
-    progress: Progress,
-) -> Inversion:
-    """The estimate of the linear law: every start on the cheap model, the best ones followed to their ends.
-
-    objective: as it is at rest; rule: of the starts that are followed, None: they end near, as the start of another
-    law. begin (n_unknowns,): the middle start, with the blocks' coefficients near the best ones there, and what it cost
-    to find them in evaluations.
-    """
-    n, bounds, rest = objective.n_parameters, settings.bounds, objective(np.zeros(objective.parameters.n_unknowns))
-    first = minimised(begun(objective, begin), bounds, NEAR, progress=progress, title="the middle start")
-    screened = _screened(first, settings, progress)
-    groups = grouped(screened, n)
-    ends = [first]
-    belongs = {groups[i]: 0 for i, m in enumerate(screened) if same_minimum(m.unknowns, first.minimum, n)}
-    others = [min(members(groups, g), key=lambda i: screened[i].evaluation.value) for g in dict.fromkeys(groups)]
-    others = sorted((i for i in others if groups[i] not in belongs), key=lambda i: screened[i].evaluation.value)
-    for number in [i for i in others if screened[i].converged][:FOLLOWED]:
-        start, belongs[groups[number]] = begun(first.objective, screened[number].unknowns), len(ends)
-        ends.append(minimised(start, bounds, COMPARED, progress=progress, title=f"start {number + 1}"))
-    same = grouped([end.minimum for end in ends], n)
-    fewest = with_fewest(ends)
-    totals = [total_counted_as(end, fewest) if end.minimum.converged else np.inf for end in ends]
-    best = [min(members(same, g), key=lambda i: totals[i]) for g in range(max(same) + 1)]
-    order = sorted(best, key=lambda i: totals[i])
-    for number in order:
-        if rule is not None and (number == order[0] or as_good(totals[number], totals[order[0]])):
-            ends[number] = minimised(ends[number], bounds, rule, progress=progress, title="linear law")
-    followed = [ends[number] for number in order]
-    rank = {number: order.index(best[same[number]]) for number in range(len(ends))}
-    starts = tuple(
-        StartRun(theta, minimum, rank[belongs[group]] if group in belongs else None)
-        for theta, minimum, group in zip(settings.every_start, screened, groups, strict=True)
-    )
-    found = concluded(followed, starts, rest, bounds, 0)
-    of_first = followed[0].counts
-    counts = sum((other.counts - of_first for other in followed[1:]), of_first)
-    evaluations += 1 + sum(end.minimum.evaluations for end in ends) + found.evaluations
-    return replace(found, evaluations=evaluations, counts=counts)
-
-
-def _screened(first: OuterIterate, settings: InversionSettings, progress: Progress) -> list[Minimum]:
-    """A minimum from every start on the cheapest model: closest points and hyper-parameters as at a first minimum.
-
-    Where that is no reduced model, on one that only has the former.
-    """
-    at, n = first.minimum, first.objective.n_parameters
-    progress(f"{len(settings.every_start)} starts, with the closest points of the first minimum")
-    cheap, found = cheapest(first.objective, at.unknowns, at.evaluation), list[Minimum]()
-    for theta in settings.every_start:
-        begin = np.concatenate([theta, at.unknowns[n:]])
-        found.append(gauss_newton(cheap, begin, bounds=settings.bounds, tolerance=AS_GOOD / 200.0))
-    return found
-
-
 def _on_cheapest(objective: Objective, unknowns: NDArray[np.float64], bounds: Bounds) -> NDArray[np.float64]:
     """Unknowns (n_unknowns,) of the minimum on the cheapest model, or on the way there as far as models are trusted."""
-    cheap = cheapest(objective, unknowns, objective(unknowns))
-    found = gauss_newton(cheap, unknowns, bounds=bounds, tolerance=AS_GOOD / 200.0)
+    (found,) = cheapest_minima(objective, unknowns, objective(unknowns), [unknowns], bounds)
     away = found.unknowns - unknowns if found.converged else np.zeros(len(unknowns))
     moduli = np.append(np.arange(objective.n_parameters), objective.parameters.acting_on_moduli)
     furthest = float(np.max(np.abs(away[moduli]), initial=0.0))

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
-from palpate.inversion.objective import Evaluation, Linearisation, Objective
-from palpate.inversion.optimise import LeastSquares
+from palpate.inversion.objective import AS_GOOD, Evaluation, Linearisation, Objective
+from palpate.inversion.optimise import Bounds, LeastSquares, Minimum, gauss_newton
 from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
@@ -230,12 +230,19 @@ def frozen_posterior(
     return FrozenPosterior(objective, tuple(states), evaluation.prior)
 
 
-def cheapest(objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation) -> LeastSquares:
-    """The objective with closest points and hyper-parameters as at an evaluation at `unknowns` (n,).
+def cheapest_minima(
+    objective: Objective,
+    unknowns: NDArray[np.float64],
+    evaluation: Evaluation,
+    begins: Sequence[NDArray[np.float64]],
+    bounds: Bounds,
+) -> list[Minimum]:
+    """The minimum from each of some places (n,), closest points and hyper-parameters as at an evaluation at `unknowns`.
 
-    Where its models are no reduced ones, on what only has the former.
+    Of the frozen posterior; where the objective's models are no reduced ones, of what only has the former.
     """
     try:
-        return frozen_posterior(objective, unknowns, evaluation)
+        cheapest: LeastSquares = frozen_posterior(objective, unknowns, evaluation)
     except ConfigurationError:
-        return fixed_correspondence(objective, unknowns, evaluation)
+        cheapest = fixed_correspondence(objective, unknowns, evaluation)
+    return [gauss_newton(cheapest, begin, bounds=bounds, tolerance=AS_GOOD / 200.0) for begin in begins]

@@ -179,9 +179,12 @@ class Objective:
         return found
 
     def linearisation_points(
-        self, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None
+        self, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, *, every: bool = True
     ) -> list[LinearisationPoint]:
-        """What unknowns (n_unknowns,) mean for each state; by an `evaluation` with the directions that decide there."""
+        """What unknowns (n_unknowns,) mean for each state; by an `evaluation` with the directions that decide there.
+
+        every: whether derivatives by `every` material mode are asked for, too.
+        """
         mapping = self.parameters
         moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
         if evaluation is None:
@@ -190,7 +193,7 @@ class Objective:
         for s, q in enumerate(coefficients):
             own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
             metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
-            points.append(LinearisationPoint(moduli, q, chain @ directions[own], metric))
+            points.append(LinearisationPoint(moduli, q, chain @ directions[own], metric, every))
         return points
 
     def under(self, approximations: Sequence[Approximation]) -> Objective:
