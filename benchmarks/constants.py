@@ -6,8 +6,9 @@
 Simulated data: rows of accuracy.py. An estimate is made with each number that stands in capitals in `palpate.inversion`
 half and twice as large (shares of a whole at most the mean of themselves and 1); the table says how far the log-moduli
 move, in their posterior standard deviations. So it does for an estimate on another number of processors, for one with
-the solver that is chosen where no factor fits into memory, and for two that begin at moduli e times as large and as
-small. The exit code is 1 where a constant moves one by more than 0.1, or one of these by more than 0.01.
+the solver that is chosen where no factor fits into memory, from starts at moduli e times as large and as small, and
+from one start alone, so far from where it would begin. The exit code is 1 where a constant moves one by more than 0.1,
+or one of these by more than 0.01.
 """
 
 from __future__ import annotations
@@ -131,11 +132,21 @@ def _starts(shift: float, case: Posed) -> Iterator[Posed]:
     yield replace(case, settings=replace(case.settings, starts=starts))
 
 
+@contextmanager
+def _begin(shift: float, case: Posed) -> Iterator[Posed]:
+    """The case with one start alone, from where all log-moduli of the place where it begins are shifted."""
+    n = case.problem.parameters.n_parameters
+    start = case.settings.centre(case.problem)[:n] + shift
+    yield replace(case, settings=replace(case.settings, starts=(start,), further=()))
+
+
 CONDITIONS = (
     Change("processors", "others", MOST_BY_CONDITION, _processors),
     Change("memory", "too little for a factor", MOST_BY_CONDITION, _memory),
     Change("starts", "e times as stiff", MOST_BY_CONDITION, partial(_starts, 1.0)),
     Change("starts", "e times as soft", MOST_BY_CONDITION, partial(_starts, -1.0)),
+    Change("begin", "one start, e times as stiff", MOST_BY_CONDITION, partial(_begin, 1.0)),
+    Change("begin", "one start, e times as soft", MOST_BY_CONDITION, partial(_begin, -1.0)),
 )
 
 

@@ -12,8 +12,7 @@ from palpate.approximation.expansion import Expansion, coarse_equilibrium, expan
 from palpate.errors import ConfigurationError, EstimationError, NotConverged
 from palpate.inversion.candidates import Inversion, InversionSettings, concluded, from_starts
 from palpate.inversion.frozen_posterior import cheapest_minima
-from palpate.inversion.hyper_parameters import with_first_noise
-from palpate.inversion.informed_subspace import informed_problem
+from palpate.inversion.informed_subspace import at_rest, informed_objective
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import AS_GOOD, Objective
 from palpate.inversion.optimise import (
@@ -73,7 +72,7 @@ def first_noise_of(
 
     Its minimum is the first one, and no estimate: no start was tried. Raises as `invert` does.
     """
-    objective, unknowns, _ = _with_reduced_bases(problem.linear(), settings, progress)
+    objective, unknowns, _ = informed_objective(problem.linear(), settings.centre(problem), progress=progress)
     nearby = minimised(begun(objective, unknowns), settings.bounds, NEAR, progress=progress, title="the first minimum")
     return nearby.objective, nearby.minimum
 
@@ -165,29 +164,11 @@ def _linear(
 ) -> Inversion:
     """The estimate of the linear law from all starts, on the states' own approximations or on reduced bases."""
     if any(state.approximation is None for state in problem.states):
-        objective, begin, spent = _with_reduced_bases(problem, settings, progress)
+        objective, begin, spent = informed_objective(problem, settings.centre(problem), progress=progress)
     else:
-        objective, begin, spent = _at_rest(Objective(problem.states, problem.parameters)), settings.centre(problem), 0
+        objective, begin, spent = at_rest(Objective(problem.states, problem.parameters)), settings.centre(problem), 0
     found = from_starts(objective, begin, settings, rule=rule, progress=progress)
     return replace(found, evaluations=found.evaluations + spent)
-
-
-def _with_reduced_bases(
-    problem: InverseProblem, settings: InversionSettings, progress: Progress
-) -> tuple[Objective, NDArray[np.float64], int]:
-    """The objective on reduced bases, unknowns (n_unknowns,) at the `centre`, the motion fitted, what it cost."""
-    informed = informed_problem(problem, settings.centre(problem), progress=progress)
-    parameters, unknowns = informed.problem.parameters, informed.unknowns
-    progress(f"how the responses to {parameters.n_coefficients} unknowns that are seen change with the moduli")
-    by_theta, coefficients = parameters.derivatives(unknowns), parameters.coefficients(unknowns)
-    triples = zip(informed.problem.states, informed.bases, coefficients, strict=True)
-    states = tuple(state.with_approximation(basis.with_modulus_series(q, by_theta)) for state, basis, q in triples)
-    return _at_rest(Objective(states, parameters)), unknowns, informed.evaluations
-
-
-def _at_rest(objective: Objective) -> Objective:
-    """The objective before any residual is seen, with what belongs together where nothing has moved."""
-    return with_first_noise(objective).rematched(np.zeros(objective.parameters.n_unknowns))
 
 
 def _on_cheapest(objective: Objective, unknowns: NDArray[np.float64], bounds: Bounds) -> NDArray[np.float64]:

@@ -25,22 +25,18 @@ from palpate.progress import Progress
 from palpate.unknowns.blocks import Acts, Block
 
 
-@dataclass(frozen=True, slots=True)
-class InformedProblem:
-    """An inverse problem on the combinations that are seen, with each state's reduced basis of them.
-
-    unknowns (n_unknowns,): where that was asked, with the boundary's motion fitted; evaluations: what that cost.
-    """
-
-    problem: InverseProblem
-    bases: tuple[ReducedBasis, ...]
-    unknowns: NDArray[np.float64]
-    evaluations: int
+def at_rest(objective: Objective) -> Objective:
+    """The objective before any residual is seen, with what belongs together where nothing has moved."""
+    return with_first_noise(objective).rematched(np.zeros(objective.parameters.n_unknowns))
 
 
-def informed_problem(problem: InverseProblem, begin: NDArray[np.float64], *, progress: Progress) -> InformedProblem:
-    """The problem on what the images tell of its blocks, by the responses of the full models at `begin` (n_unknowns,).
+def informed_objective(
+    problem: InverseProblem, begin: NDArray[np.float64], *, progress: Progress
+) -> tuple[Objective, NDArray[np.float64], int]:
+    """The objective at rest on what the images tell of its blocks, by the full models' responses at `begin` (n,).
 
+    Its states have reduced bases of these. With it come its unknowns (n_unknowns,) of `begin`, the boundary's motion
+    fitted, and the evaluations spent.
     x of a block with the widest covariance C = L L^T is seen along the eigenvectors of L^T A L, A = J^T W J its
     information: an eigenvalue l is the variance that x may explain along one over that of the noise, and what is left
     out widens the posterior by a share of less than its sum (Spantini et al. 2015, SIAM J. Sci. Comput. 37, A2451,
@@ -67,9 +63,12 @@ def informed_problem(problem: InverseProblem, begin: NDArray[np.float64], *, pro
     bases = [
         informed_combinations(b, data[np.ix_(own, own)]) for b, own in zip(parameters.blocks, columns, strict=True)
     ]
+    fit = [inverse @ middle[own] for own, (_, inverse) in zip(columns, bases, strict=True)]
+    unknowns = np.concatenate([middle[: parameters.n_parameters], *fit])
     blocks = tuple(b.combined(inverse) for b, (_, inverse) in zip(parameters.blocks, bases, strict=True))
-    reduced, kept = list[LaterState](), list[ReducedBasis]()
-    for s, state in enumerate(problem.states):
+    seen, informed = replace(parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0))), list[LaterState]()
+    progress(f"how the responses to {seen.n_coefficients} unknowns that are seen change with the moduli")
+    for s, (state, q) in enumerate(zip(problem.states, seen.coefficients(unknowns), strict=True)):
         of_state = [(b.acts, basis) for b, (basis, _) in zip(parameters.blocks, bases, strict=True) if s in b.states]
         boundary, material = (
             linalg.block_diag(np.zeros((0, 0)), *(basis for acts, basis in of_state if acts is wanted))
@@ -77,12 +76,10 @@ def informed_problem(problem: InverseProblem, begin: NDArray[np.float64], *, pro
         )
         n_poisson = len(state.model.material.poisson)
         fields = material[: material.shape[0] - n_poisson, : material.shape[1] - n_poisson]
-        reduced.append(state.combined(boundary, fields))
-        kept.append(found.pop(0).combined(reduced[-1].model, boundary, material))
-    theta = middle[: parameters.n_parameters]
-    fit = [inverse @ middle[own] for own, (_, inverse) in zip(columns, bases, strict=True)]
-    seen = InverseProblem(tuple(reduced), replace(parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0))))
-    return InformedProblem(seen, tuple(kept), np.concatenate([theta, *fit]), evaluations)
+        reduced = state.combined(boundary, fields)
+        basis = found.pop(0).combined(reduced.model, boundary, material)
+        informed.append(reduced.with_approximation(basis.with_modulus_series(q, seen.derivatives(unknowns))))
+    return at_rest(Objective(tuple(informed), seen)), unknowns, evaluations
 
 
 @dataclass(frozen=True, slots=True)

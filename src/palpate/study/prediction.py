@@ -91,7 +91,7 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
     J^T W J + P, which for these least squares is the Fisher information of images and prior: J needs no later image but
     for the motion of what is prescribed. The noise in it is the one that the case states, or that the images show where
     an estimate begins. Elements are linear ones on the given meshes, so that this takes seconds; a modulus is guessed
-    as its tissue states it, else as the middle start has it. Layers round organs are free. Finite strains, the voxels'
+    as its tissue states it, else where the search begins. Layers round organs are free. Finite strains, the voxels'
     place and the mesh are not in it. Raises as an estimate does.
     """
     coarse = replace(case, mechanics=Mechanics("linear", "P1", solver=case.mechanics.solver))

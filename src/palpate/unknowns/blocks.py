@@ -66,7 +66,7 @@ class Block:
     its cause among their rivals explain as much. released: held at 0 as well while an estimate is sought, and free
     under P where its interval is, and in the estimate where that is likelier, by log prior odds of `released_odds`.
     left_out: variances of the first noise, a tenth of the found one, that what is left out of the unknowns may explain
-    (see `informed_problem`); below 0 none is. regions: numbers of the model's regions whose moduli it multiplies, one
+    (see `informed_objective`); below 0 none is. regions: numbers of the model's regions whose moduli it multiplies, one
     unknown x for all of them, where it acts on moduli: a `share` s of each, in series with the rest of it, is e^x times
     as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is believed where that is not normal;
     an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
