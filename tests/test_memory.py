@@ -1,8 +1,9 @@
-"""Free memory: the machine's, or less where a control group limits it."""
+"""Free memory, the machine's or less where a control group limits it; and memory that is kept."""
 
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 
@@ -97,3 +98,31 @@ def test_images_that_this_machine_cannot_hold_are_refused_with_the_numbers(envir
     environment(PALPATE_MEMORY_GB="0.005")
     with pytest.raises(ResourceError, match=r"40 x 40 x 40 voxels.*0\.0 GB of memory.*crop the images"):
         refusals.refuse_large(image, "before.nii.gz")
+
+
+AGAIN = """
+import resource
+from palpate.cli.entry import keep_freed_memory
+kept = {kept}
+size = 128 * 2**20
+bytearray(size)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+bytearray(size)
+print(kept, (resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) * resource.getpagesize() / size)
+"""
+
+
+def fresh_share(kept, **environment):
+    """Whether memory is kept, and which share of a second large array's pages the system must give anew."""
+    own = {name: value for name, value in os.environ.items() if not name.startswith(("MALLOC_", "GLIBC_"))}
+    run = [sys.executable, "-c", AGAIN.format(kept=kept)]
+    told, share = subprocess.run(run, env=own | environment, check=True, capture_output=True, text=True).stdout.split()
+    return told, float(share)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library keeps memory as it will")
+def test_memory_that_an_array_left_serves_the_next_one():
+    """Unless the environment already says what the C library is to do."""
+    assert fresh_share("keep_freed_memory()") == ("True", pytest.approx(0.0, abs=0.01))
+    assert fresh_share(None)[1] > 0.9
+    assert fresh_share("keep_freed_memory()", MALLOC_ARENA_MAX="4")[0] == "False"

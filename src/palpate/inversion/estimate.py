@@ -163,10 +163,11 @@ def _linear(
     problem: InverseProblem, settings: InversionSettings, rule: StopRule | None, progress: Progress
 ) -> Inversion:
     """The estimate of the linear law from all starts, on the states' own approximations or on reduced bases."""
+    begin, spent = settings.centre(problem), 0
     if any(state.approximation is None for state in problem.states):
-        objective, begin, spent = informed_objective(problem, settings.centre(problem), progress=progress)
+        objective, begin, spent = informed_objective(problem, begin, progress=progress)
     else:
-        objective, begin, spent = at_rest(Objective(problem.states, problem.parameters)), settings.centre(problem), 0
+        objective = at_rest(Objective(problem.states, problem.parameters))
     found = from_starts(objective, begin, settings, rule=rule, progress=progress)
     return replace(found, evaluations=found.evaluations + spent)
 

@@ -74,7 +74,8 @@ class LinearModel:
         """
         conditions.require_same_free(self.constraint)
         constraint = conditions.constraint
-        given = sparse.csr_matrix(np.column_stack([constraint.modes, constraint.offset]))
+        both = [sparse.csr_matrix(part) for part in (constraint.modes, constraint.offset[:, None])]
+        given = sparse.hstack(both, format="csr")
         coupling = tuple(sparse.csr_matrix(constraint.free.T @ (matrix @ given)) for matrix in self.stiffness)
         return replace(self, conditions=conditions, coupling=coupling)
 
@@ -252,7 +253,8 @@ class LinearSystem:
         """As `responses`, in single precision, some modes at a time: the largest thing there is, at half its size."""
         constraint = self.model.constraint
         loads = sparse.csc_matrix(weighted_sum(self.moduli, self.model.coupling))
-        found = np.column_stack([constraint.modes, constraint.offset]).astype(np.float32)
+        found = np.empty((len(constraint.offset), constraint.n_modes + 1), dtype=np.float32)
+        found[:, :-1], found[:, -1] = constraint.modes, constraint.offset
         for start in range(0, loads.shape[1], AT_ONCE):
             some = loads[:, start : start + AT_ONCE].toarray()
             if start + AT_ONCE >= loads.shape[1]:

@@ -16,6 +16,7 @@ from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.forward import DenseEquilibrium, Outputs, checked_coefficients, checked_moduli
 from palpate.mechanics.linear_model import LinearModel
 from palpate.mechanics.solvers.conjugate_gradients import column_norms, times
+from palpate.parallel import mapped
 
 RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
 WELL_CONDITIONED = 1e-12  # of the Gram matrix' largest eigenvalue: above it Cholesky's factor orthogonalises safely
@@ -264,8 +265,9 @@ def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
     lengths = column_norms(snapshots) if snapshots.ndim == 2 else np.zeros(1)
     if snapshots.ndim != 2 or not np.all(np.isfinite(lengths)) or not np.any(lengths > 0.0):
         raise ConfigurationError(f"a reduced basis needs finite, non-zero snapshots (n, k); got {snapshots.shape}")
-    moving = lengths > 0.0
-    scaled = np.asarray((snapshots if moving.all() else np.ascontiguousarray(snapshots[:, moving])) / lengths[moving])
+    moving = np.flatnonzero(lengths)
+    scaled = np.array(snapshots) if len(moving) == len(lengths) else np.take(snapshots, moving, axis=1)
+    scaled /= lengths[moving]
     gram = scaled.T @ scaled
     sizes = np.linalg.eigvalsh(gram)
     if sizes[0] > WELL_CONDITIONED * sizes[-1]:
@@ -273,8 +275,12 @@ def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
             # V R^-1 in place of V, with V^T V = R^T R: a second copy would be among the largest there are
             factor = linalg.cholesky(scaled.T @ scaled if again else gram, check_finite=False)
             inverse = linalg.solve_triangular(factor, np.eye(len(factor)), check_finite=False)
-            for start in range(0, len(scaled), ROWS):
-                scaled[start : start + ROWS] = scaled[start : start + ROWS] @ inverse
+
+            def turned(start: int, by: NDArray[np.float64] = inverse) -> None:
+                """Some rows times R^-1, in their place."""
+                scaled[start : start + ROWS] = scaled[start : start + ROWS] @ by
+
+            mapped(turned, range(0, len(scaled), ROWS))
         return scaled
     q, r = np.linalg.qr(scaled)
     rotation, values, _ = np.linalg.svd(r)
