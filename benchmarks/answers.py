@@ -3,8 +3,8 @@
     python benchmarks/answers.py [--rows clean,noise,...] [--cases N] [--first-seed S] [--output FILE] [--json]
 
 For each case two estimates from the same images, by one and the same outer loop. One is the product's. The plain one
-knows no reduced model, no frozen factor and no derivative that is not exact: it starts at one place, and
-the full model is solved, factorised and differentiated by all moduli and modes wherever the loop leads. It ends at a
+knows no reduced model, no frozen factor and no derivative that is not exact: it tries no start, and the
+full model is solved, factorised and differentiated by all moduli and modes wherever the loop leads. It ends at a
 fifth of what the product may leave open. At finite strain it goes on from its own linear estimate. Simulated data.
 
 The answers are the same where they differ by 0.1 %, or by 0.05 posterior standard deviations where that is more; the

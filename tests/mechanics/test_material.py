@@ -203,7 +203,7 @@ def test_far_away_what_decides_is_exact_where_no_response_to_every_material_mode
     first = first.with_material(first.system.material_responses(model.solve(MODULI, every).values), MODULI)
     moduli, n, boundary = MODULI * [2.0, 1.0], model.n_regions + len(every), model.n_regions + body[1].n_modes
     directions = rng.normal(size=(n, 2))
-    basis = first.update(LinearisationPoint(moduli, every, directions, np.eye(n), every=False))
+    basis = first.update(LinearisationPoint(moduli, every, directions, np.eye(n), all_material=False))
     homogeneous = np.concatenate([coefficients[0], 0.0 * coefficients[1]])
     along = [
         of.solve(moduli, homogeneous).tangent()[:, boundary:] @ directions[boundary:] for of in (model, basis.model)

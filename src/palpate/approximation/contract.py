@@ -46,15 +46,15 @@ class LinearisationPoint:
     """Moduli (n_regions,) kPa and driver coefficients (n_modes,) at which a model is approximated.
 
     directions (n_regions + n_modes, k) of (ln E, q): those along which derivatives are made exact, None where the
-    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there; every:
-    whether they are made so along all material modes, too, where these are known of far moduli.
+    displacement alone is; metric (n_regions + n_modes, n_regions + n_modes): the Gauss-Newton matrix there;
+    all_material: whether they are made so by all material modes, too, where these are known of far moduli.
     """
 
     moduli: NDArray[np.float64]
     coefficients: NDArray[np.float64]
     directions: NDArray[np.float64] | None = None
     metric: NDArray[np.float64] | None = None
-    every: bool = True
+    all_material: bool = True
 
     def same_as(self, other: LinearisationPoint | None) -> bool:
         """Whether moduli and coefficients are those of another place."""

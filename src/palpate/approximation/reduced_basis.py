@@ -145,9 +145,11 @@ class ReducedBasis:
 
     def _stale(self, at: LinearisationPoint) -> bool:
         """Whether responses to the material modes are not there yet, or of far from a place that asks for them all."""
-        if not self.full_model.material.n_modes or not len(self.material_at):
-            return bool(self.full_model.material.n_modes)
-        return at.every and bool(np.abs(np.log(at.moduli / self.material_at)).max() > STALE)
+        if not self.full_model.material.n_modes:
+            return False
+        if not len(self.material_at):
+            return True
+        return at.all_material and bool(np.abs(np.log(at.moduli / self.material_at)).max() > STALE)
 
     def _homogeneous(self, at: LinearisationPoint) -> NDArray[np.float64]:
         """The displacement (n_dof,) mm at a place as it would be of homogeneous tissues."""

@@ -72,8 +72,8 @@ def keep_freed_memory() -> bool:
     with suppress(ImportError, AttributeError, OSError, TypeError):
         import ctypes
 
-        tell = ctypes.CDLL(None).mallopt
-        return all(tell(parameter, value) == 1 for parameter, value in KEPT)
+        mallopt = ctypes.CDLL(None).mallopt
+        return all(mallopt(parameter, value) == 1 for parameter, value in KEPT)
     return False
 
 

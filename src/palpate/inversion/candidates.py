@@ -113,19 +113,17 @@ def from_starts(
     """The minima that all starts lead to: each on the cheapest model, the best ones followed on the objective's own.
 
     objective: as it is at rest; begin (n_unknowns,): where the first minimum is sought. rule: when the best one ends,
-    and others that are as good; None: all end near, as the start of another law.
+    and others that are as good; None: all end near, as the start of another law. Raises as `invert` does.
     """
     n, bounds, rest = objective.n_parameters, settings.bounds, objective(np.zeros(objective.parameters.n_unknowns))
     first = minimised(begun(objective, begin), bounds, NEAR, progress=progress, title="the first minimum")
     screened = _screened(first, settings, progress)
     ends, groups = [first], grouped(screened, n)
     belongs = {groups[i]: 0 for i, m in enumerate(screened) if same_minimum(m.unknowns, first.minimum, n)}
-    lowest_last = sorted(range(len(screened)), key=lambda i: -screened[i].evaluation.value)
-    lowest = {groups[i]: i for i in lowest_last if groups[i] not in belongs}
-    others = [i for i in reversed(lowest_last) if i in lowest.values() and screened[i].converged]
-    for number in others[:FOLLOWED]:
-        start, belongs[groups[number]] = begun(first.objective, screened[number].unknowns), len(ends)
-        ends.append(minimised(start, bounds, COMPARED, progress=progress, title=f"start {number + 1}"))
+    for number in sorted(range(len(screened)), key=lambda i: screened[i].evaluation.value):
+        if len(ends) <= FOLLOWED and groups[number] not in belongs and screened[number].converged:
+            start, belongs[groups[number]] = begun(first.objective, screened[number].unknowns), len(ends)
+            ends.append(minimised(start, bounds, COMPARED, progress=progress, title=f"start {number + 1}"))
     pairs = zip(settings.every_start, screened, groups, strict=True)
     starts = tuple(StartRun(theta, minimum, belongs.get(group)) for theta, minimum, group in pairs)
     found = concluded(ends, starts, rest, bounds, 0)

@@ -34,7 +34,7 @@ from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, during
 
 REPORTED = StopRule()
-ASKED = replace(NEAR, every=False)  # whether images tell of what was fixed hangs on what decides the moduli alone
+RELEASED = replace(NEAR, all_material=False)  # whether images tell of what was fixed hangs on what decides alone
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
 
 
@@ -134,7 +134,7 @@ def with_released(
         objective = objective.under(near)
         start = begun(objective, _on_cheapest(objective, unknowns, bounds), history=before.minimum.history)
         start = replace(start, checks=before.checks)
-        end = free = minimised(start, bounds, ASKED, progress=progress, title=title)
+        end = free = minimised(start, bounds, RELEASED, progress=progress, title=title)
         followed = _followed(inversion, before, free, free)
         gain = before.objective.total(before.minimum.evaluation) - total_counted_as(free, before)
         gain += min(block.released_odds for block in released)

@@ -36,7 +36,7 @@ def informed_objective(
     """The objective at rest on what the images tell of its blocks, by the full models' responses at `begin` (n,).
 
     Its states have reduced bases of these. With it come its unknowns (n_unknowns,) of `begin`, the boundary's motion
-    fitted, and the evaluations spent.
+    fitted, and the evaluations spent. Raises as `invert` does.
     x of a block with the widest covariance C = L L^T is seen along the eigenvectors of L^T A L, A = J^T W J its
     information: an eigenvalue l is the variance that x may explain along one over that of the noise, and what is left
     out widens the posterior by a share of less than its sum (Spantini et al. 2015, SIAM J. Sci. Comput. 37, A2451,

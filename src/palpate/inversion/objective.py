@@ -179,11 +179,11 @@ class Objective:
         return found
 
     def linearisation_points(
-        self, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, *, every: bool = True
+        self, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, *, all_material: bool = True
     ) -> list[LinearisationPoint]:
         """What unknowns (n_unknowns,) mean for each state; by an `evaluation` with the directions that decide there.
 
-        every: whether derivatives by `every` material mode are asked for, too.
+        all_material: whether derivatives by all material modes are asked for, too.
         """
         mapping = self.parameters
         moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
@@ -193,7 +193,7 @@ class Objective:
         for s, q in enumerate(coefficients):
             own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
             metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
-            points.append(LinearisationPoint(moduli, q, chain @ directions[own], metric, every))
+            points.append(LinearisationPoint(moduli, q, chain @ directions[own], metric, all_material))
         return points
 
     def under(self, approximations: Sequence[Approximation]) -> Objective:

@@ -71,7 +71,7 @@ class StopRule:
     step_sd, floor: a log-modulus may still move by so many of its standard deviations, or by `floor` (of ln E) where
     that is more; coefficients: the decrement a coefficient that may be left; model_error: share of the tolerance by
     which what the approximation misses may set it off, inf: none is asked for; derivatives: whether those that decide
-    the moduli must be exact so near; every: whether those by all material modes must be made so with them; learn:
+    the moduli must be exact so near; all_material: whether those by all material modes are made so with them; learn:
     whether hyper-parameters are sought, too; correlate: whether the numbers of independent residuals are taken anew;
     iterations: the largest number, in the second half of which the trust region grows no more and no alternative is
     chosen anew, so that none comes and goes.
@@ -82,7 +82,7 @@ class StopRule:
     coefficients: float = np.inf
     model_error: float = 1.0
     derivatives: bool = True
-    every: bool = True
+    all_material: bool = True
     learn: bool = True
     correlate: bool = True
     iterations: int = 25
@@ -388,7 +388,7 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule) -
         _, off, cost = model_error(objective, minimum)
         checks, missing = checks + cost, float(np.max(off / (rule.model_error * tolerance), initial=0.0))
     if max(missing, left) >= 1.0:
-        points = objective.linearisation_points(unknowns, minimum.evaluation, every=rule.every)
+        points = objective.linearisation_points(unknowns, minimum.evaluation, all_material=rule.all_material)
         pairs = zip(objective.approximations, points, strict=True)
         objective = objective.under([approximation.update(point) for approximation, point in pairs])
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2

@@ -16,7 +16,6 @@ from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.forward import DenseEquilibrium, Outputs, checked_coefficients, checked_moduli
 from palpate.mechanics.linear_model import LinearModel
 from palpate.mechanics.solvers.conjugate_gradients import column_norms, times
-from palpate.parallel import mapped
 
 RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
 WELL_CONDITIONED = 1e-12  # of the Gram matrix' largest eigenvalue: above it Cholesky's factor orthogonalises safely
@@ -275,12 +274,8 @@ def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
             # V R^-1 in place of V, with V^T V = R^T R: a second copy would be among the largest there are
             factor = linalg.cholesky(scaled.T @ scaled if again else gram, check_finite=False)
             inverse = linalg.solve_triangular(factor, np.eye(len(factor)), check_finite=False)
-
-            def turned(start: int, by: NDArray[np.float64] = inverse) -> None:
-                """Some rows times R^-1, in their place."""
-                scaled[start : start + ROWS] = scaled[start : start + ROWS] @ by
-
-            mapped(turned, range(0, len(scaled), ROWS))
+            for start in range(0, len(scaled), ROWS):
+                scaled[start : start + ROWS] = scaled[start : start + ROWS] @ inverse
         return scaled
     q, r = np.linalg.qr(scaled)
     rotation, values, _ = np.linalg.svd(r)
