@@ -86,7 +86,7 @@ def test_the_frozen_factor_certifies_the_reduced_answer(model, small):
 
 def test_selected_outputs_are_the_rows_of_all(small, rng):
     moduli, q = np.array([1.0, 6.0]), np.array([1.0, 2.0])
-    dofs = rng.permutation(len(small.output_basis))[:30]
+    dofs = rng.permutation(len(small.output_modes))[:30]
     whole, part = small.solve(moduli, q), small.outputs(lambda values: values[dofs]).solve(moduli, q)
     assert np.allclose(part.values, whole.values[dofs], atol=1e-13)
     assert np.allclose(part.tangent(), whole.tangent()[dofs], atol=1e-13)

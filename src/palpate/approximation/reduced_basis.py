@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from palpate.approximation.contract import LinearisationPoint, ModelError, determined
 from palpate.mechanics.forward import SolveCounts
-from palpate.mechanics.linear_model import LinearModel, LinearSystem, weighted_sum
+from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.mechanics.reduced import Projection, ReducedModel, projection
-from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients, times
+from palpate.mechanics.solvers.conjugate_gradients import Product, conjugate_gradients
 from palpate.mechanics.solvers.contract import AT_ONCE, Factorisation
 from palpate.mechanics.solvers.registry import SOLVERS, CheckedFactorisation
 from palpate.mesh.space import Constraint
@@ -22,7 +22,7 @@ SERIES = 40  # vectors at the most
 FAR = 30.0  # spread of the moduli's ratios to the factorised ones, beyond which a new factorisation costs less
 FAR_ALONE = 300.0  # the same for a single right-hand side, of some 4 sqrt(spread) iterations
 SNAPSHOT = 1e-5  # relative residual of basis vectors: what they miss is measured at each place and added there
-DISPLACEMENT, TANGENT = 1e-4, 1e-2  # of the reduced model's error, that a correction may leave
+DISPLACEMENT, TANGENT = 3e-4, 1e-2  # of the reduced model's error, that a correction may leave
 STALE = 0.3  # of ln E, from which on all responses to the material modes are made anew
 MANY = 128  # responses to material modes, as those of a map, that cost more by iterations than by a factor of their own
 FAR_OFF = 3e-3  # of the displacement, missing: derivatives are off by as small a share
@@ -89,35 +89,28 @@ class ReducedBasis:
         if many or not direct or ratios.max() >= far * ratios.min():
             near = model.system(at.moduli)
             sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=1))
-        matrix = weighted_sum(at.moduli, model.free_stiffness)
-        displacement = self._homogeneous(at)
+        displacement, along = self._homogeneous(at), _Directions.at(at, model, material=not stale)
+        product, new = partial(model.free_forces, at.moduli), int(not at.same_as(self.place))
 
         def solved(rhs: NDArray[np.float64], tolerance: float | NDArray[np.float64]) -> NDArray[np.float64]:
             """Solution (n_free, k) mm at the place to a relative residual, one or (k,)."""
             nearly = near.factorisation.nearly
-            return conjugate_gradients(matrix, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)[0]
+            return conjugate_gradients(product, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)[0]
 
-        new, directions = int(not at.same_as(self.place)), at.directions  # whether the displacement is sought, too
-        if directions is not None:
-            directions = directions[: model.n_regions + model.constraint.n_modes]
-        loads = -model.residual(at.moduli, displacement[:, None])[:, :new]
-        if directions is not None:
-            derivatives = model.boundary_loads(at.moduli, displacement, directions)
-            amplitudes = self.model.system(at.moduli).backward(self.projection.components(derivatives))
-            loads = np.concatenate([loads, derivatives - matrix @ self.projection.spanned(amplitudes)], axis=1)
+        sought = -model.residual(at.moduli, displacement[:, None])[:, :new]  # whether the displacement is, too
+        loads = np.concatenate([sought, self._lacking(at, displacement, along, product)], axis=1)
         if loads.shape[1]:
-            missing = solved(loads, np.array([DISPLACEMENT] * new + [TANGENT] * (loads.shape[1] - new)))
-            cost = SolveCounts(forward=new, tangent=loads.shape[1] - new)
+            missing = solved(loads, np.array([DISPLACEMENT] * new + [TANGENT] * along.number))
+            cost = SolveCounts(forward=new, tangent=along.number)
             late = np.asarray(model.constraint.free @ missing[:, :new])
-            if directions is not None and np.linalg.norm(late) > FAR_OFF * np.linalg.norm(displacement):
-                by_modulus = np.where(np.arange(len(directions))[:, None] < model.n_regions, directions, 0.0)
-                missing[:, new:] += solved(model.boundary_loads(at.moduli, late[:, 0], by_modulus), TANGENT)
-                cost += SolveCounts(tangent=directions.shape[1])
+            if along.number and np.linalg.norm(late) > FAR_OFF * np.linalg.norm(displacement):
+                missing[:, new:] += solved(along.by_displacement(model).loads(model, at.moduli, late[:, 0]), TANGENT)
+                cost += SolveCounts(tangent=along.number)
             displacement = displacement + late.sum(axis=1)
-            sharper = replace(_extended(sharper, missing, cost), place=at)
-        if stale:
-            return _with_all_material(sharper, at, displacement, matrix, solved)
-        return _with_sharper_material(sharper, at, displacement, matrix, solved)
+            last = new + along.boundary.shape[1]
+            sharper = replace(_with_material_along(sharper, at, along.material, missing[:, last:]), place=at)
+            sharper = _extended(sharper, missing[:, :last], cost)
+        return _with_all_material(sharper, at, displacement, product, solved) if stale else sharper
 
     @property
     def error_counts(self) -> SolveCounts:
@@ -157,6 +150,20 @@ class ReducedBasis:
         of_boundary = np.where(np.arange(len(at.coefficients)) < boundary, at.coefficients, 0.0)
         return self.model.solve(at.moduli, of_boundary).values
 
+    def _lacking(
+        self, at: LinearisationPoint, displacement: NDArray[np.float64], along: _Directions, product: Product
+    ) -> NDArray[np.float64]:
+        """What the derivatives that are there leave of their loads (n_free, k), mN, at a place along directions.
+
+        displacement (n_dof,) mm; product: with the stiffness there.
+        """
+        if not along.number:
+            return np.zeros((self.constraint.free.shape[1], 0))
+        loads, first = along.loads(self.full_model, at.moduli, displacement), along.boundary.shape[1]
+        amplitudes = self.model.system(at.moduli).backward(self.projection.components(loads[:, :first]))
+        material = np.asarray(self.constraint.free.T @ (self.model.output_material @ along.material))
+        return loads - product(np.concatenate([self.projection.spanned(amplitudes), material], axis=1))
+
     def with_modulus_series(self, coefficients: NDArray[np.float64], by_theta: NDArray[np.float64]) -> ReducedBasis:
         """Add how the displacement at `coefficients` (n_modes,) changes with the parameters, to high order.
 
@@ -192,6 +199,48 @@ class ReducedBasis:
         return _extended(replace(self, system=system), fresh, cost)
 
 
+@dataclass(frozen=True, slots=True)
+class _Directions:
+    """Those of (ln E, boundary modes) (n_regions + n_boundary, k), and of material modes (n_material, l).
+
+    Along the latter the coefficients at the place are one: of their part of the displacement nothing is missed then.
+    """
+
+    boundary: NDArray[np.float64]
+    material: NDArray[np.float64]
+
+    @classmethod
+    def at(cls, place: LinearisationPoint, model: LinearModel, *, material: bool) -> _Directions:
+        """The directions of a place, none where it has none; of material modes where these are asked for."""
+        first, modes = model.n_regions + model.constraint.n_modes, np.zeros((model.material.n_modes, 0))
+        if place.directions is None:
+            return cls(np.zeros((first, 0)), modes)
+        if material and place.metric is not None and len(modes):
+            modes = np.column_stack([place.directions[first:], place.coefficients[model.constraint.n_modes :]])
+            modes = modes[:, np.linalg.norm(modes, axis=0) > 0.0]
+        return cls(place.directions[:first], modes)
+
+    @property
+    def number(self) -> int:
+        """How many they are."""
+        return int(self.boundary.shape[1] + self.material.shape[1])
+
+    def by_displacement(self, model: LinearModel) -> _Directions:
+        """Those along which loads depend on the displacement."""
+        of_moduli = np.arange(len(self.boundary))[:, None] < model.n_regions
+        return replace(self, boundary=np.where(of_moduli, self.boundary, 0.0))
+
+    def loads(
+        self, model: LinearModel, moduli: NDArray[np.float64], displacement: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Loads (n_free, k + l), mN, of the derivatives at moduli (n_regions,) kPa and u (n_dof,) mm."""
+        loads = model.boundary_loads(moduli, displacement, self.boundary)
+        if not self.material.shape[1]:
+            return loads
+        forces = model.material_forces(moduli, displacement, self.material)
+        return np.concatenate([loads, -np.asarray(model.constraint.free.T @ forces)], axis=1)
+
+
 def reduced_basis(model: LinearModel, moduli: NDArray[np.float64]) -> ReducedBasis:
     """The model on its responses to every boundary mode at moduli (n_regions,) kPa; one factorisation."""
     system = model.system(moduli)
@@ -208,12 +257,12 @@ def _with_all_material(
     basis: ReducedBasis,
     at: LinearisationPoint,
     displacement: NDArray[np.float64],
-    matrix: sparse.csr_matrix[np.float64],
+    product: Product,
     solved: Callable[[NDArray[np.float64], float], NDArray[np.float64]],
 ) -> ReducedBasis:
     """All responses to the material modes made exact at a place, from what they are elsewhere.
 
-    displacement (n_dof,) mm and stiffness `matrix` (n_free, n_free) mN/mm there; solved: see `ReducedBasis.update`.
+    displacement (n_dof,) mm and the product with the stiffness there; solved: see `ReducedBasis.update`.
     """
     model, free, n = basis.full_model, basis.constraint.free, basis.full_model.material.n_modes
     by_material, responses = model.by_material(at.moduli, displacement), basis.model.output_material.copy()
@@ -221,37 +270,24 @@ def _with_all_material(
         some = slice(start, start + AT_ONCE)
         loads = -np.asarray(free.T @ by_material.along(np.eye(n)[:, some]))
         known = np.asarray(free.T @ responses[:, some])
-        responses[:, some] += np.asarray(free @ solved(loads - times(matrix, known), TANGENT))
+        responses[:, some] += np.asarray(free @ solved(loads - product(known), TANGENT))
     return replace(basis, counts=basis.counts + SolveCounts(tangent=n)).with_material(responses, at.moduli)
 
 
-def _with_sharper_material(
-    basis: ReducedBasis,
-    at: LinearisationPoint,
-    displacement: NDArray[np.float64],
-    matrix: sparse.csr_matrix[np.float64],
-    solved: Callable[[NDArray[np.float64], float], NDArray[np.float64]],
+def _with_material_along(
+    basis: ReducedBasis, at: LinearisationPoint, along: NDArray[np.float64], missing: NDArray[np.float64]
 ) -> ReducedBasis:
-    """The responses U to the material modes made exact at a place along its directions D of these coefficients.
+    """The responses U to the material modes made exact at a place along directions D, which miss (n_free, k) there.
 
-    They become U + (C - U D) (D^T H D)^+ D^T H with the exact C and the metric H, as those of an `Expansion`. The
-    coefficients at the place are one of the directions: of their part of the displacement nothing is missed then.
+    They become U + (C - U D) (D^T H D)^+ D^T H with the exact C and the metric H, as those of an `Expansion`.
     """
-    model, first = basis.full_model, basis.full_model.n_regions + basis.constraint.n_modes
-    if not model.material.n_modes or at.directions is None or at.metric is None:
+    if not along.shape[1] or at.metric is None:
         return basis
-    along, metric = at.directions[first:], at.metric[first:, first:]
-    along = np.column_stack([along, at.coefficients[basis.constraint.n_modes :]])
-    along = along[:, np.linalg.norm(along, axis=0) > 0.0]
-    free, before = model.constraint.free, basis.model.output_material
-    loads = -np.asarray(free.T @ model.material_forces(at.moduli, displacement, along))
-    known = np.asarray(free.T @ (before @ along))
-    lacking = loads - times(matrix, known)
-    change = np.asarray(free @ solved(lacking, TANGENT))
+    first = basis.full_model.n_regions + basis.constraint.n_modes
+    metric, change = at.metric[first:, first:], np.asarray(basis.constraint.free @ missing)
     with determined():
         share = np.linalg.pinv(along.T @ metric @ along, hermitian=True) @ (along.T @ metric)
-    counts = basis.counts + SolveCounts(tangent=along.shape[1])
-    return replace(basis, projection=basis.projection.with_material(before + change @ share), counts=counts)
+    return replace(basis, projection=basis.projection.with_material(basis.model.output_material + change @ share))
 
 
 def _extended(basis: ReducedBasis, snapshots: NDArray[np.float64], cost: SolveCounts) -> ReducedBasis:

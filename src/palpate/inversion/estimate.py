@@ -128,10 +128,7 @@ def with_released(
     unknowns, bounds = before.minimum.unknowns, settings.bounds
     followed, title = inversion, f"with {' and '.join(dict.fromkeys(block.cause for block in released))} free"
     try:
-        objective, evaluation = before.objective.released(before.minimum.evaluation, unknowns)
-        points = objective.linearisation_points(unknowns, evaluation)
-        near = [known.update(point) for known, point in zip(objective.approximations, points, strict=True)]
-        objective = objective.under(near)
+        objective, _ = before.objective.released(before.minimum.evaluation, unknowns)
         start = begun(objective, _on_cheapest(objective, unknowns, bounds), history=before.minimum.history)
         start = replace(start, checks=before.checks)
         end = free = minimised(start, bounds, RELEASED, progress=progress, title=title)

@@ -190,6 +190,10 @@ class Objective:
         if evaluation is None:
             return [LinearisationPoint(moduli, q) for q in coefficients]
         directions, points = deciding_directions(evaluation, mapping.n_parameters), []
+        if any(block.released for block in mapping.blocks):  # those that decide where they are free, too
+            _, free = self.released(evaluation, unknowns)
+            more = deciding_directions(free, mapping.n_parameters)[:, mapping.n_parameters :]
+            directions = np.concatenate([directions, more], axis=1)
         for s, q in enumerate(coefficients):
             own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
             metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
@@ -294,8 +298,8 @@ class Objective:
 
     def _linearised(self, s: int, unknowns: NDArray[np.float64]) -> list[Linearisation]:
         state, solution = self.states[s], self._equilibrium(s, unknowns)
-        tangent = self.parameters.by_unknowns(solution.tangent(), unknowns)
-        columns, n_offsets = self.parameters.unknowns_of(s), len(self.parameters.offsets(unknowns, s))
+        tangent, columns = solution.tangent(), self.parameters.unknowns_of(s)
+        n_offsets = len(self.parameters.offsets(unknowns, s))
         seen = self._residuals(s, solution.values, unknowns)
         numbers = {name: number for number, name in enumerate(self.parameters.offset_names(s))}
 
@@ -304,7 +308,8 @@ class Objective:
             rows, (observation, residuals) = of
             direct = None if residuals.direct is None else (residuals.direct, self._by_material(s, unknowns))
             number = numbers.get(observation.name)
-            jacobian = jacobian_of(residuals.jacobian, tangent[rows], number=number, n_offsets=n_offsets, direct=direct)
+            own = self.parameters.by_unknowns(tangent[rows], unknowns)
+            jacobian = jacobian_of(residuals.jacobian, own, number=number, n_offsets=n_offsets, direct=direct)
             weights = _robust_weights(observation, residuals)
             return Linearisation.of(observation, s, residuals, columns, jacobian, weights)
 

@@ -22,6 +22,7 @@ from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.loads import Load
 from palpate.mechanics.material import HOMOGENEOUS, MaterialForces, MaterialModes, material_forces
 from palpate.mechanics.rigid import linear_displacements, rigid_modes
+from palpate.mechanics.solvers.conjugate_gradients import times
 from palpate.mechanics.solvers.contract import AT_ONCE, EXACT, Factorisation
 from palpate.mechanics.solvers.registry import factorise
 from palpate.mechanics.stiffness import (
@@ -140,6 +141,13 @@ class LinearModel:
         total = np.zeros_like(displacements)
         for modulus, matrix in zip(moduli, self.stiffness, strict=True):
             total += modulus * (matrix @ displacements)
+        return total
+
+    def free_forces(self, moduli: NDArray[np.float64], free: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Forces F^T K(E) F z (n_free, k), mN, of free displacements z (n_free, k) mm at moduli (n_regions,) kPa."""
+        total = np.zeros_like(free)
+        for modulus, matrix in zip(moduli, self.free_stiffness, strict=True):  # their sum is copied at each addition
+            total += modulus * times(matrix, free)
         return total
 
     def boundary_loads(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from palpate.errors import SolverError
-from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
+from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients, times
 from palpate.mechanics.solvers.contract import Factorisation
 
 TIGHT = 1e-12  # of the residual, relative
@@ -35,9 +36,8 @@ class LinearisedSystem:
         """Solution X (n, m) of A X = rhs (n, m) to a relative residual of `tolerance`; raises `SolverError`."""
         if not self.symmetric:
             return np.stack([self._unsymmetric(column, tolerance) for column in rhs.T], axis=1)
-        solution, _ = conjugate_gradients(
-            self.matrix, rhs, self.nearby.nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS
-        )
+        product, nearly = partial(times, self.matrix), self.nearby.nearly
+        solution, _ = conjugate_gradients(product, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)
         return solution
 
     def nearly(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ from palpate.errors import SolverError
 from palpate.mechanics.balance import TissueBalance
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.pattern import Stiffness
-from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
+from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients, times
 from palpate.mechanics.solvers.contract import Factorisation
 
 Array = NDArray[np.float64]
@@ -208,9 +209,9 @@ def _solved(way: _Way, path: NewtonPath, stiffness: Stiffness, load: Array, forc
     balance, column = way.balance, load[:, None]
     try:
         if path.factorisation is not None and balance.symmetric:
-            matrix, nearby = balance.restricted(stiffness), path.factorisation.nearly
+            product, nearby = partial(times, balance.restricted(stiffness)), path.factorisation.nearly
             with contextlib.suppress(SolverError):
-                free, n = conjugate_gradients(matrix, column, nearby, tolerance=forcing, max_iterations=MAX_GRADIENTS)
+                free, n = conjugate_gradients(product, column, nearby, tolerance=forcing, max_iterations=MAX_GRADIENTS)
                 return free[:, 0], path.solved(n)
             path = replace(path, counts=path.counts + SolveCounts(forward=MAX_GRADIENTS))
         path = path.with_factorisation(balance.factorise(stiffness))

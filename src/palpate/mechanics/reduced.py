@@ -6,20 +6,23 @@ densely, one for each region, the loads' once. Quarteroni, Manzoni & Negri, Redu
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, sparse
 
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.forward import DenseEquilibrium, Outputs, checked_coefficients, checked_moduli
 from palpate.mechanics.linear_model import LinearModel
-from palpate.mechanics.solvers.conjugate_gradients import column_norms, times
+from palpate.mechanics.solvers.conjugate_gradients import WORTH_THREADS, column_norms, times
+from palpate.parallel import mapped, processors
 
 RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
 WELL_CONDITIONED = 1e-12  # of the Gram matrix' largest eigenvalue: above it Cholesky's factor orthogonalises safely
-CHUNK = 64  # basis vectors multiplied with a stiffness at once
+CHUNK = 32  # basis vectors multiplied with a stiffness at once
 ROWS = 4096  # of them, made orthogonal at once
 
 
@@ -28,7 +31,8 @@ class ReducedModel:
     """A linear model on m basis vectors; implements `ForwardModel`.
 
     Per region at 1 kPa: stiffness (n_regions, m, m) and coupling (n_regions, m, n_boundary + 1), mN/mm; load (m,) mN.
-    Outputs (rows): output_basis (n_outputs, m), output_modes (n_outputs, n_boundary), output_offset (n_outputs,) and
+    Outputs (rows): output_basis (n_outputs, m), in blocks of columns so that what is added to it copies nothing of what
+    is there; output_modes (n_outputs, n_boundary), output_offset (n_outputs,) and
     output_material (n_outputs, n_material), mm: the responses du/dc_k to the material modes, held as they are.
     """
 
@@ -36,7 +40,7 @@ class ReducedModel:
     stiffness: NDArray[np.float64]
     coupling: NDArray[np.float64]
     load: NDArray[np.float64]
-    output_basis: NDArray[np.float64]
+    output_basis: tuple[NDArray[np.float64], ...]
     output_modes: NDArray[np.float64]
     output_offset: NDArray[np.float64]
     output_material: NDArray[np.float64]
@@ -61,11 +65,41 @@ class ReducedModel:
         """Number m of basis vectors."""
         return int(self.stiffness.shape[1])
 
+    def spanned(self, amplitudes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Outputs (n_outputs,) or (n_outputs, k) mm of basis coefficients (m,) or (m, k) alone."""
+        ends = np.cumsum([block.shape[1] for block in self.output_basis])[:-1]
+        pairs = list(zip(self.output_basis, np.split(amplitudes, ends), strict=True))
+
+        def rows(part: slice) -> NDArray[np.float64]:
+            """Some of the outputs."""
+            return np.asarray(sum((block[part] @ own for block, own in pairs[1:]), pairs[0][0][part] @ pairs[0][1]))
+
+        return np.concatenate(self._by_rows(rows, amplitudes.size))
+
+    def components(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Products (m,) or (m, k) of each basis vector's outputs with values (n_outputs,) or (n_outputs, k)."""
+
+        def of_rows(part: slice) -> NDArray[np.float64]:
+            """What some outputs add to them."""
+            return np.concatenate([block[part].T @ values[part] for block in self.output_basis])
+
+        found = self._by_rows(of_rows, self.n_basis * values.size // max(len(values), 1))
+        return np.asarray(np.sum(found, axis=0))
+
+    def _by_rows(self, work: Callable[[slice], NDArray[np.float64]], numbers: int) -> list[NDArray[np.float64]]:
+        """What work makes of ranges of outputs, each by a thread where products with so many numbers are worth it."""
+        n = len(self.output_modes)
+        if n * numbers < WORTH_THREADS:
+            return [work(slice(0, n))]
+        return mapped(
+            work, [slice(*ends) for ends in pairwise(np.linspace(0, n, processors() + 1).astype(int).tolist())]
+        )
+
     def outputs(self, seen: Outputs) -> ReducedModel:
         """The same model with the outputs that a linear map makes of the present ones."""
         return replace(
             self,
-            output_basis=seen(self.output_basis),
+            output_basis=(np.concatenate([seen(block) for block in self.output_basis], axis=1),),
             output_modes=seen(self.output_modes),
             output_offset=seen(self.output_offset),
             output_material=seen(self.output_material),
@@ -127,7 +161,7 @@ class ReducedSystem:
         """Outputs (n_outputs, n_modes + 1) mm for each unit mode without the offset and, last, for the offset."""
         model = self.model
         given = np.column_stack([model.output_modes, model.output_offset])
-        return np.asarray(given + model.output_basis @ self.amplitudes)
+        return np.asarray(given + model.spanned(self.amplitudes))
 
     def solve(self, coefficients: NDArray[np.float64]) -> ReducedEquilibrium:
         """Equilibrium at mode coefficients (n_modes,), dimensionless: no further solve."""
@@ -135,7 +169,7 @@ class ReducedSystem:
         boundary, material = np.split(checked, [model.n_boundary])
         amplitude = self.amplitudes @ np.append(boundary, 1.0)
         given = model.output_modes @ boundary + model.output_offset + model.output_material @ material
-        values = given + model.output_basis @ amplitude
+        values = given + model.spanned(amplitude)
         values.setflags(write=False)
         return ReducedEquilibrium(self, checked, amplitude, values)
 
@@ -161,14 +195,14 @@ class ReducedEquilibrium(DenseEquilibrium):
     def tangent(self) -> NDArray[np.float64]:
         """T (n_outputs, n_regions + n_modes), mm: columns du / d ln E_r, then du / dq_k."""
         model = self.system.model
-        tangent = model.output_basis @ self.amplitude_tangent()
+        tangent = model.spanned(self.amplitude_tangent())
         tangent[:, model.n_regions :] += model.output_modes
         return np.concatenate([tangent, model.output_material], axis=1)
 
     def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
         """T^T g (n_regions + n_modes,) for g (n_outputs,), by one dense adjoint solve."""
         model = self.system.model
-        reduced = model.output_basis.T @ gradient
+        reduced = model.components(gradient)
         adjoint = self.system.backward(reduced[:, None])[:, 0]
         by_modulus = -self._modulus_forces().T @ adjoint
         by_mode = self.system.amplitudes[:, :-1].T @ reduced + model.output_modes.T @ gradient
@@ -192,11 +226,11 @@ class Projection:
     def spanned(self, amplitudes: NDArray[np.float64]) -> NDArray[np.float64]:
         """V a (n_free, k) for amplitudes a (m, k)."""
         # V = F^T (F V) is not kept beside the outputs F V: twice they would be the largest of all
-        return np.asarray(self.model.constraint.free.T @ (self.reduced.output_basis @ amplitudes))
+        return np.asarray(self.model.constraint.free.T @ self.reduced.spanned(amplitudes))
 
     def components(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """V^T f (m, k) of f (n_free, k)."""
-        return np.asarray(self.reduced.output_basis.T @ (self.model.constraint.free @ forces))
+        return self.reduced.components(np.asarray(self.model.constraint.free @ forces))
 
     def extended(self, snapshots: NDArray[np.float64]) -> Projection:
         """The projection on the span of the present vectors and of snapshots (n_free, k) mm.
@@ -224,7 +258,7 @@ class Projection:
             stiffness=np.stack(blocks),
             coupling=np.concatenate([old.coupling, _coupling(model, fresh)], axis=1),
             load=np.concatenate([old.load, fresh.T @ model.free_load]),
-            output_basis=np.concatenate([old.output_basis, model.constraint.free @ fresh], axis=1),
+            output_basis=(*old.output_basis, np.asarray(model.constraint.free @ fresh)),
         )
         return Projection(model, reduced)
 
@@ -239,19 +273,24 @@ def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection
     They are made orthonormal and their rank cut; raises `ConfigurationError` when their rows are not n_free.
     """
     vectors = orthonormal_basis(_checked(model, snapshots))
-    stiffness = np.empty((len(model.free_stiffness), vectors.shape[1], vectors.shape[1]))
-    for own, matrix in zip(stiffness, model.free_stiffness, strict=True):  # V^T A V; A is empty but for its own rows
-        touched = np.flatnonzero(np.diff(matrix.indptr))
-        rows, touching = vectors[touched], matrix[touched]
-        for start in range(0, vectors.shape[1], CHUNK):
-            columns = slice(start, start + CHUNK)
-            own[:, columns] = rows.T @ times(touching, vectors[:, columns])
-        own[:] = 0.5 * (own + own.T)
+    stiffness = np.stack([_projected(matrix, vectors) for matrix in model.free_stiffness])
     load, coupling = np.asarray(vectors.T @ model.free_load), _coupling(model, vectors)
     outputs, constraint = np.asarray(model.constraint.free @ vectors), model.constraint
     none = np.zeros((len(outputs), model.material.n_modes))
-    reduced = ReducedModel(model.names, stiffness, coupling, load, outputs, constraint.modes, constraint.offset, none)
+    reduced = ReducedModel(
+        model.names, stiffness, coupling, load, (outputs,), constraint.modes, constraint.offset, none
+    )
     return Projection(model, reduced)
+
+
+def _projected(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """V^T A V (m, m) for V (n, m) and a symmetric A (n, n) that is empty but for some rows and columns."""
+    touched, m = np.flatnonzero(np.diff(matrix.indptr)), vectors.shape[1]
+    within, rows = matrix[touched][:, touched], vectors[touched]
+    parts = [slice(start, start + CHUNK) for start in range(0, m, CHUNK)]
+    products = mapped(lambda part: rows.T @ np.asarray(within @ np.ascontiguousarray(rows[:, part])), parts)
+    projected = np.concatenate(products, axis=1)
+    return np.asarray(0.5 * (projected + projected.T))
 
 
 def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -267,19 +306,24 @@ def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
     moving = np.flatnonzero(lengths)
     scaled = np.array(snapshots) if len(moving) == len(lengths) else np.take(snapshots, moving, axis=1)
     scaled /= lengths[moving]
-    gram = scaled.T @ scaled
+    parts = [scaled[start : start + ROWS] for start in range(0, len(scaled), ROWS)]
+    gram = _gram(parts)
     sizes = np.linalg.eigvalsh(gram)
     if sizes[0] > WELL_CONDITIONED * sizes[-1]:
         for again in (False, True):
             # V R^-1 in place of V, with V^T V = R^T R: a second copy would be among the largest there are
-            factor = linalg.cholesky(scaled.T @ scaled if again else gram, check_finite=False)
+            factor = linalg.cholesky(_gram(parts) if again else gram, check_finite=False)
             inverse = linalg.solve_triangular(factor, np.eye(len(factor)), check_finite=False)
-            for start in range(0, len(scaled), ROWS):
-                scaled[start : start + ROWS] = scaled[start : start + ROWS] @ inverse
+            mapped(lambda pair: np.copyto(pair[0], pair[0] @ pair[1]), [(part, inverse) for part in parts])
         return scaled
     q, r = np.linalg.qr(scaled)
     rotation, values, _ = np.linalg.svd(r)
     return np.asarray(q @ rotation[:, : int(np.sum(values > RANK_TOLERANCE * values[0]))])
+
+
+def _gram(parts: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """V^T V (m, m) of a V that is given by its rows, part after part."""
+    return np.asarray(np.sum(mapped(lambda part: part.T @ part, parts), axis=0))
 
 
 def _checked(model: LinearModel, snapshots: NDArray[np.float64]) -> NDArray[np.float64]:

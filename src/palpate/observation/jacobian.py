@@ -102,11 +102,10 @@ def jacobian_of(
 
     Columns of n_offsets offsets follow, of which that with a `number` is the residuals' own; None: they have none.
     """
-    ones = sparse.csr_matrix(np.ones((smooth.shape[0], 1)))
-    below = np.zeros((1, tangent.shape[1] + n_offsets))
+    ones, (n_dofs, k) = sparse.csr_matrix(np.ones((smooth.shape[0], 1))), tangent.shape
+    held = direct or (np.zeros((smooth.shape[0], 0)), np.zeros((0, k)))
+    rows = np.zeros((n_dofs + 1 + len(held[1]), k + n_offsets))
+    rows[:n_dofs, :k], rows[n_dofs + 1 :, :k] = tangent, held[1]
     if n_offsets and number is not None:
-        below[0, tangent.shape[1] + number] = 1.0
-    held = direct or (np.zeros((smooth.shape[0], 0)), np.zeros((0, tangent.shape[1])))
-    rows = [np.pad(tangent, ((0, 0), (0, n_offsets))), below, np.pad(held[1], ((0, 0), (0, n_offsets)))]
-    seen = sparse.hstack([smooth, ones, sparse.csr_matrix(held[0])], format="csr")
-    return Jacobian(sparse.csr_matrix(seen), np.concatenate(rows))
+        rows[n_dofs, k + number] = 1.0
+    return Jacobian(sparse.csr_matrix(sparse.hstack([smooth, ones, sparse.csr_matrix(held[0])], format="csr")), rows)

@@ -1,4 +1,4 @@
-"""A product with vectors is the product, in whatever order its columns are taken and by however many threads."""
+"""A product with vectors is the product, by however many threads."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from palpate.mechanics.solvers.conjugate_gradients import FEW, WORTH_THREADS, times
+from palpate.mechanics.solvers.conjugate_gradients import WORTH_THREADS, times
 
 
-@pytest.mark.parametrize("n_columns", [0, 1, 3, FEW - 1, FEW, FEW + 5])
+@pytest.mark.parametrize("n_columns", [0, 1, 3, 13])
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_it_is_that_of_the_dense_matrix(n_columns, order):
     rng = np.random.default_rng(2)
@@ -23,7 +23,7 @@ def test_it_is_that_of_the_dense_matrix(n_columns, order):
 
 
 @pytest.mark.parametrize("threads", ["1", "2", "3"])
-@pytest.mark.parametrize("n_columns", [FEW - 1, FEW])
+@pytest.mark.parametrize("n_columns", [1, 7])
 def test_threads_change_not_a_bit_of_it(threads, n_columns, environment):
     environment(OMP_NUM_THREADS=threads)
     rng = np.random.default_rng(3)

@@ -12,20 +12,17 @@ from scipy import sparse
 from palpate.errors import SolverError
 from palpate.parallel import mapped, processors
 
-FEW = 8  # columns, up to which one after the other is faster: SciPy's kernel for several has no registers for so few
 WORTH_THREADS = 3_000_000  # products; below, handing them to a thread takes longer than it spares
 ROOM = 2**28  # bytes of the vectors of columns that are iterated together
 VECTORS = 8  # that a column takes
 FEWEST = 32  # columns together, below which products with a factor are slow
 
+Product = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # of a matrix (n, n) with vectors (n, k)
+
 
 def times(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """A X (n, k) for A (n, m) and X (m, k), in the unit of their products."""
-    number = vectors.shape[1]
-    if 0 < number < FEW:
-        share = mapped if matrix.nnz >= WORTH_THREADS and number > 1 else map
-        return np.stack(list(share(matrix.dot, np.ascontiguousarray(vectors.T))), axis=1)
-    if matrix.nnz * number < WORTH_THREADS or processors() == 1:
+    if matrix.nnz * vectors.shape[1] < WORTH_THREADS or processors() == 1:
         return np.asarray(matrix @ vectors)
     together = np.ascontiguousarray(vectors)
 
@@ -33,9 +30,10 @@ def times(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -
         """Those of the product from the first to before the last."""
         begin, end = part
         entries = slice(int(matrix.indptr[begin]), int(matrix.indptr[end]))
-        places = matrix.indptr[begin : end + 1] - matrix.indptr[begin]
-        own = (matrix.data[entries], matrix.indices[entries], places)
-        return np.asarray(sparse.csr_matrix(own, shape=(end - begin, matrix.shape[1])) @ together)
+        own = sparse.csr_matrix((end - begin, matrix.shape[1]))  # which would copy the entries, were it made of them
+        own.data, own.indices = matrix.data[entries], matrix.indices[entries]
+        own.indptr = matrix.indptr[begin : end + 1] - matrix.indptr[begin]
+        return np.asarray(own @ together)
 
     share_of = np.linspace(0, matrix.nnz, processors() + 1)[1:-1]
     ends = [0, *np.searchsorted(matrix.indptr, share_of).tolist(), matrix.shape[0]]
@@ -48,16 +46,17 @@ def column_norms(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def conjugate_gradients(
-    matrix: sparse.csr_matrix[np.float64],
+    product: Product,
     rhs: NDArray[np.float64],
-    precondition: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    precondition: Product,
     *,
     tolerance: float | NDArray[np.float64],
     max_iterations: int,
 ) -> tuple[NDArray[np.float64], int]:
     """Solution X (n, m) of A X = rhs (n, m), one iteration for each column but all products at once; and how many.
 
-    precondition maps residuals (n, k) to nearly A^-1 times them; tolerance, one or (m,), is of the relative residual.
+    product maps X (n, k) to A X, precondition residuals (n, k) to nearly A^-1 times them; tolerance, one or (m,), is of
+    the relative residual.
     Hestenes & Stiefel, J. Res. NBS 49 (1952) 409-436. Columns are taken together as far as their vectors have room.
     Raises `SolverError` for a direction of no positive energy and when the tolerance is not met.
     """
@@ -69,7 +68,7 @@ def conjugate_gradients(
             np.array_split(rhs, number_of_parts, axis=1), np.array_split(tolerances, number_of_parts), strict=True
         )
         found = [
-            conjugate_gradients(matrix, part, precondition, tolerance=own, max_iterations=max_iterations)
+            conjugate_gradients(product, part, precondition, tolerance=own, max_iterations=max_iterations)
             for part, own in parts
         ]
         return np.concatenate([solution for solution, _ in found], axis=1), max(number for _, number in found)
@@ -81,16 +80,16 @@ def conjugate_gradients(
         return solution, 0
     residual = rhs[:, active].copy()
     direction = precondition(residual)
-    product = np.einsum("ij,ij->j", residual, direction)
+    remaining = np.einsum("ij,ij->j", residual, direction)
     for number in range(1, max_iterations + 1):
-        image = times(matrix, direction)
+        image = product(direction)
         energy = np.einsum("ij,ij->j", direction, image)
         if not np.all(energy > 0.0):
             raise SolverError(
                 f"the stiffness of {len(rhs)} unknowns is not positive definite: a direction has the energy"
                 f" {np.min(energy):.3g}; hold the body somewhere and check for inverted tetrahedra"
             )
-        alpha = product / energy
+        alpha = remaining / energy
         image *= alpha
         residual -= image
         running = column_norms(residual) > limits[active]
@@ -104,9 +103,9 @@ def conjugate_gradients(
             active, residual, direction = active[running], residual[:, running], direction[:, running]
         preconditioned = precondition(residual)
         following = np.einsum("ij,ij->j", residual, preconditioned)
-        direction *= following / product[running]
+        direction *= following / remaining[running]
         direction += preconditioned
-        product = following
+        remaining = following
     worst = float(np.max(column_norms(residual) / norms[active]))
     raise SolverError(
         f"conjugate gradients stopped at a relative residual of {worst:.2g} (tolerance {tolerances.min():g}) after"

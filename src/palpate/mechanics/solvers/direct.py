@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from scipy import sparse
 import multifrontal
 from multifrontal import NotPositiveDefinite
 from palpate.errors import ResourceError, SolverError
-from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
+from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients, times
 from palpate.mechanics.solvers.contract import EXACT, Expectation, Factorisation, Factoriser, Hints, Solver
 from palpate.parallel import processors
 from palpate.processes import available_memory
@@ -61,7 +61,9 @@ class MixedFactorisation:
     def solve(self, rhs: NDArray[np.float64], *, tolerance: float = EXACT) -> NDArray[np.float64]:
         """Solution X (n, m) of A X = rhs (n, m) to a relative residual of `tolerance`; raises `SolverError`."""
         steps = MAX_REFINEMENTS
-        return conjugate_gradients(self.matrix, rhs, self.nearly, tolerance=tolerance, max_iterations=steps)[0]
+        return conjugate_gradients(
+            partial(times, self.matrix), rhs, self.nearly, tolerance=tolerance, max_iterations=steps
+        )[0]
 
 
 def _factor(matrix: sparse.csr_matrix[np.float64], dtype: type) -> multifrontal.Factor:
@@ -124,7 +126,7 @@ def _expect(matrix: sparse.csr_matrix[np.float64], hints: Hints, dtype: type) ->
 
 
 def _solver(name: str, factorise: Factoriser, dtype: type) -> Solver:
-    expect, of_size = functools.partial(_expect, dtype=dtype), functools.partial(_expect_of_size, dtype=dtype)
+    expect, of_size = partial(_expect, dtype=dtype), partial(_expect_of_size, dtype=dtype)
     return Solver(name, factorise, True, expect, of_size)
 
 

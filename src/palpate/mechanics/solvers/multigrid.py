@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +80,9 @@ class MultigridFactorisation:
     def solve(self, rhs: NDArray[np.float64], *, tolerance: float = EXACT) -> NDArray[np.float64]:
         """Solution X (n, m) of A X = rhs (n, m) to a relative residual of `tolerance`; raises `SolverError`."""
         steps = MAX_ITERATIONS
-        return conjugate_gradients(self.matrix, rhs, self.cycle, tolerance=tolerance, max_iterations=steps)[0]
+        return conjugate_gradients(
+            partial(times, self.matrix), rhs, self.cycle, tolerance=tolerance, max_iterations=steps
+        )[0]
 
     nearly = solve
 
