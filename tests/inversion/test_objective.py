@@ -10,7 +10,7 @@ import pytest
 from palpate.approximation import reduced_basis
 from palpate.images.tissue import Role
 from palpate.inversion import Objective
-from palpate.inversion.objective import LinearisedObjective
+from palpate.inversion.objective import LinearisedObjective, deciding_directions
 from palpate.observation.contract import Weighting
 from palpate.observation.robust_loss import PowerLaw
 from palpate.unknowns import layer_blocks
@@ -159,15 +159,37 @@ def test_residuals_beyond_the_cutoff_count_less(twins, twin):
     assert np.array_equal(weights < shares, np.abs(values) > 0.5)
 
 
-def test_a_known_tissue_released_as_a_whole_is_a_prior_of_the_scale(twins, twin):
-    """Moduli scaled together leave u unchanged: ln E of all organs then varies by as much as that of the tissue."""
-    problem, sd = twins.voxel_problem(twin), 0.4
+def with_a_held_tissue(twins, twin, sd):
+    """The objective with ln E of the known tissue held but for its release, and unknowns near the truth."""
+    problem = twins.voxel_problem(twin)
     tissues, regions = twin.scene.tissues, problem.states[0].model.regions
     region = next(i for i, number in enumerate(regions) if tissues[number].role is Role.KNOWN)
     blocks = (*problem.parameters.blocks, *layer_blocks((("organ", (region,), 1.0),), (0,), sd=sd, thickness_mm=1.0))
     parameters = replace(problem.parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0)))
-    held = objective_of(replace(problem, parameters=parameters))
-    unknowns = np.concatenate([twin.unknowns, [0.0]])
+    return objective_of(replace(problem, parameters=parameters)), np.concatenate([twin.unknowns, [0.0]])
+
+
+def test_derivatives_are_exact_along_what_decides_with_held_blocks_free_too(twins, twin):
+    """So that an estimate goes on with them free from where it has ended, and no model is made exact there again."""
+    held, unknowns = with_a_held_tissue(twins, twin, sd=0.4)
+    evaluation, (basis,) = held(unknowns), held.approximations
+    (point,) = held.linearisation_points(unknowns, evaluation)
+    free, seen = held.released(evaluation, unknowns)
+    along = free.parameters.chain(0, unknowns) @ deciding_directions(seen, 2)[free.parameters.unknowns_of(0)]
+    assert np.allclose(point.directions[:, 4:], along[:, 2:], atol=1e-12)
+    assert not np.allclose(point.directions[:, 2:4], along[:, 2:], rtol=0.01)
+    truth = basis.full_model.solve(point.moduli, point.coefficients).tangent() @ along
+    before, after = (
+        np.abs(known.model.solve(point.moduli, point.coefficients).tangent() @ along - truth).max()
+        for known in (basis, basis.update(point))
+    )
+    assert after < 0.01 * before
+
+
+def test_a_known_tissue_released_as_a_whole_is_a_prior_of_the_scale(twins, twin):
+    """Moduli scaled together leave u unchanged: ln E of all organs then varies by as much as that of the tissue."""
+    sd = 0.4
+    held, unknowns = with_a_held_tissue(twins, twin, sd)
     free, seen = held.released(held(unknowns), unknowns)
     anew = free(unknowns)
     for name in ("value", "score", "matrix"):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigurationError, SolverError
+from palpate.mechanics import reduced
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.reduced import orthonormal_basis, projection
@@ -112,6 +113,24 @@ def test_an_extended_projection_is_that_on_all_vectors(model):
     small, full = grown.reduced.solve(moduli, q), whole.solve(moduli, q)
     assert relative(small.values, full.values) < 1e-9
     assert relative(small.tangent(), full.tangent()) < 1e-8
+
+
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_what_is_added_copies_nothing_and_spans_with_what_is_there_by_any_threads(
+    model, threads, environment, monkeypatch
+):
+    environment(OMP_NUM_THREADS=threads)
+    monkeypatch.setattr(reduced, "WORTH_THREADS", 0)
+    snapshots, rng = basis(model), np.random.default_rng(5)
+    small = projection(model, snapshots[:, :4])
+    grown = small.extended(snapshots[:, 4:7])
+    (first,), (same, added) = small.reduced.output_basis, grown.reduced.output_basis
+    assert same is first
+    whole = np.column_stack([first, added])
+    for shape in ((), (3,)):
+        amplitudes, values = rng.standard_normal((7, *shape)), rng.standard_normal((len(whole), *shape))
+        assert np.allclose(grown.reduced.spanned(amplitudes), whole @ amplitudes, atol=1e-12)
+        assert np.allclose(grown.reduced.components(values), whole.T @ values, atol=1e-12)
 
 
 def test_what_is_there_already_extends_nothing(model):

@@ -77,8 +77,9 @@ class ReducedBasis:
         """Add what the reduced model misses at a place: of the displacement there, and of its derivatives.
 
         Both are corrections by conjugate gradients with the factorisation that is there, from the reduced answers on;
-        where it is none, or the moduli are far from its own, with a new one. The derivatives are those of the reduced
-        displacement, and of what it missed where that is no small share. Raises `SolverError`.
+        where it is none, or the moduli are far from its own, with a new one. The derivatives, sought together with the
+        displacement, are those of the reduced one, and of what it missed where that is no small share. Raises
+        `SolverError`.
         """
         model, near, sharper = self.full_model, self.system, self
         direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
@@ -90,14 +91,15 @@ class ReducedBasis:
             near = model.system(at.moduli)
             sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=1))
         displacement, along = self._homogeneous(at), _Directions.at(at, model, material=not stale)
-        product, new = partial(model.free_forces, at.moduli), int(not at.same_as(self.place))
+        product = partial(model.free_forces, at.moduli)
+        new = int(not at.same_as(self.place))  # whether the displacement is sought, too
 
         def solved(rhs: NDArray[np.float64], tolerance: float | NDArray[np.float64]) -> NDArray[np.float64]:
             """Solution (n_free, k) mm at the place to a relative residual, one or (k,)."""
             nearly = near.factorisation.nearly
             return conjugate_gradients(product, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)[0]
 
-        sought = -model.residual(at.moduli, displacement[:, None])[:, :new]  # whether the displacement is, too
+        sought = -model.residual(at.moduli, displacement[:, None])[:, :new]
         loads = np.concatenate([sought, self._lacking(at, displacement, along, product)], axis=1)
         if loads.shape[1]:
             missing = solved(loads, np.array([DISPLACEMENT] * new + [TANGENT] * along.number))

@@ -128,7 +128,7 @@ def with_released(
     unknowns, bounds = before.minimum.unknowns, settings.bounds
     followed, title = inversion, f"with {' and '.join(dict.fromkeys(block.cause for block in released))} free"
     try:
-        objective, _ = before.objective.released(before.minimum.evaluation, unknowns)
+        objective = replace(before.objective, parameters=before.objective.parameters.released())
         start = begun(objective, _on_cheapest(objective, unknowns, bounds), history=before.minimum.history)
         start = replace(start, checks=before.checks)
         end = free = minimised(start, bounds, RELEASED, progress=progress, title=title)
