@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -14,7 +13,7 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.mechanics.reduced import Projection, ReducedModel, projection
 from palpate.mechanics.solvers.conjugate_gradients import Product, conjugate_gradients
-from palpate.mechanics.solvers.contract import AT_ONCE, Factorisation
+from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import SOLVERS, CheckedFactorisation
 from palpate.mesh.space import Constraint
 
@@ -83,14 +82,14 @@ class ReducedBasis:
         """
         model, near, sharper = self.full_model, self.system, self
         direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
-        ratios, stale = at.moduli / near.moduli, at.directions is not None and self._stale(at)
-        many = stale and model.material.n_modes > MANY
+        ratios, every = at.moduli / near.moduli, at.directions is not None and self._stale(at)
+        many = every and model.material.n_modes > MANY
         far = FAR if at.directions is not None else FAR_ALONE
         # solutions that iterate themselves help none; many right-hand sides are worth a factorisation of their own
         if many or not direct or ratios.max() >= far * ratios.min():
             near = model.system(at.moduli)
             sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=1))
-        displacement, along = self._homogeneous(at), _Directions.at(at, model, material=not stale)
+        displacement, along = self._homogeneous(at), _Directions.at(at, model, every=every)
         product = partial(model.free_forces, at.moduli)
         new = int(not at.same_as(self.place))  # whether the displacement is sought, too
 
@@ -108,11 +107,12 @@ class ReducedBasis:
             if along.number and np.linalg.norm(late) > FAR_OFF * np.linalg.norm(displacement):
                 missing[:, new:] += solved(along.by_displacement(model).loads(model, at.moduli, late[:, 0]), TANGENT)
                 cost += SolveCounts(tangent=along.number)
-            displacement = displacement + late.sum(axis=1)
             last = new + along.boundary.shape[1]
-            sharper = replace(_with_material_along(sharper, at, along.material, missing[:, last:]), place=at)
-            sharper = _extended(sharper, missing[:, :last], cost)
-        return _with_all_material(sharper, at, displacement, product, solved) if stale else sharper
+            material = _changed(along.material, at.metric, missing[:, last:], every=every)
+            responses = self.model.output_material + np.asarray(model.constraint.free @ material)
+            sharper = sharper.with_material(responses, at.moduli if every else self.material_at)
+            sharper = _extended(replace(sharper, place=at), missing[:, :last], cost)
+        return sharper
 
     @property
     def error_counts(self) -> SolveCounts:
@@ -205,19 +205,22 @@ class ReducedBasis:
 class _Directions:
     """Those of (ln E, boundary modes) (n_regions + n_boundary, k), and of material modes (n_material, l).
 
-    Along the latter the coefficients at the place are one: of their part of the displacement nothing is missed then.
+    Along the latter, all of them or those of the place, the coefficients there are one, too: of their part of the
+    displacement nothing is missed then.
     """
 
     boundary: NDArray[np.float64]
     material: NDArray[np.float64]
 
     @classmethod
-    def at(cls, place: LinearisationPoint, model: LinearModel, *, material: bool) -> _Directions:
-        """The directions of a place, none where it has none; of material modes where these are asked for."""
+    def at(cls, place: LinearisationPoint, model: LinearModel, *, every: bool) -> _Directions:
+        """The directions of a place, none where it has none; every: with all material modes."""
         first, modes = model.n_regions + model.constraint.n_modes, np.zeros((model.material.n_modes, 0))
         if place.directions is None:
             return cls(np.zeros((first, 0)), modes)
-        if material and place.metric is not None and len(modes):
+        if every:
+            modes = np.eye(len(modes))
+        elif place.metric is not None and len(modes):
             modes = np.column_stack([place.directions[first:], place.coefficients[model.constraint.n_modes :]])
             modes = modes[:, np.linalg.norm(modes, axis=0) > 0.0]
         return cls(place.directions[:first], modes)
@@ -255,41 +258,21 @@ def basis_of(system: LinearSystem, responses: NDArray[np.float64], counts: Solve
     return ReducedBasis(projection(system.model, snapshots), system, counts)
 
 
-def _with_all_material(
-    basis: ReducedBasis,
-    at: LinearisationPoint,
-    displacement: NDArray[np.float64],
-    product: Product,
-    solved: Callable[[NDArray[np.float64], float], NDArray[np.float64]],
-) -> ReducedBasis:
-    """All responses to the material modes made exact at a place, from what they are elsewhere.
+def _changed(
+    along: NDArray[np.float64], metric: NDArray[np.float64] | None, missing: NDArray[np.float64], *, every: bool
+) -> NDArray[np.float64]:
+    """Change (n_free, n_material) mm of the responses U to the material modes that are exact along directions D.
 
-    displacement (n_dof,) mm and the product with the stiffness there; solved: see `ReducedBasis.update`.
+    missing (n_free, k): C - U D with the exact C. They become U + (C - U D) (D^T H D)^+ D^T H with the metric H (n, n)
+    of all, as those of an `Expansion`; with every mode along itself C.
     """
-    model, free, n = basis.full_model, basis.constraint.free, basis.full_model.material.n_modes
-    by_material, responses = model.by_material(at.moduli, displacement), basis.model.output_material.copy()
-    for start in range(0, n, AT_ONCE):
-        some = slice(start, start + AT_ONCE)
-        loads = -np.asarray(free.T @ by_material.along(np.eye(n)[:, some]))
-        known = np.asarray(free.T @ responses[:, some])
-        responses[:, some] += np.asarray(free @ solved(loads - product(known), TANGENT))
-    return replace(basis, counts=basis.counts + SolveCounts(tangent=n)).with_material(responses, at.moduli)
-
-
-def _with_material_along(
-    basis: ReducedBasis, at: LinearisationPoint, along: NDArray[np.float64], missing: NDArray[np.float64]
-) -> ReducedBasis:
-    """The responses U to the material modes made exact at a place along directions D, which miss (n_free, k) there.
-
-    They become U + (C - U D) (D^T H D)^+ D^T H with the exact C and the metric H, as those of an `Expansion`.
-    """
-    if not along.shape[1] or at.metric is None:
-        return basis
-    first = basis.full_model.n_regions + basis.constraint.n_modes
-    metric, change = at.metric[first:, first:], np.asarray(basis.constraint.free @ missing)
+    if every:
+        return missing
+    if metric is None or not along.shape[1]:
+        return np.zeros((len(missing), len(along)))
+    own = metric[-len(along) :, -len(along) :]
     with determined():
-        share = np.linalg.pinv(along.T @ metric @ along, hermitian=True) @ (along.T @ metric)
-    return replace(basis, projection=basis.projection.with_material(basis.model.output_material + change @ share))
+        return np.asarray(missing @ (np.linalg.pinv(along.T @ own @ along, hermitian=True) @ (along.T @ own)))
 
 
 def _extended(basis: ReducedBasis, snapshots: NDArray[np.float64], cost: SolveCounts) -> ReducedBasis:

@@ -21,6 +21,7 @@ from palpate.inversion.trust_region import fit_coefficients
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
+from palpate.parallel import mapped, processors
 from palpate.progress import Progress
 from palpate.unknowns.blocks import Acts, Block
 
@@ -112,9 +113,9 @@ class _Responses:
     ) -> ReducedBasis:
         """The reduced basis of combinations (n_boundary, k) and (n_material, l), of which `model` is made."""
         every = linalg.block_diag(boundary, np.eye(1)).astype(np.float32)
-        responses = np.asarray(self.boundary @ every, dtype=np.float64)
+        parts = mapped(lambda rows: (rows @ every).astype(np.float64), np.array_split(self.boundary, processors()))
         cost = self.system.response_counts + SolveCounts(tangent=self.material.shape[1])
-        basis = basis_of(replace(self.system, model=model), responses, cost)
+        basis = basis_of(replace(self.system, model=model), np.concatenate(parts), cost)
         responses = np.asarray(self.material @ material.astype(np.float32), dtype=np.float64)
         return basis.with_material(responses, self.system.moduli)
 

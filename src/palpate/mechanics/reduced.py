@@ -6,7 +6,7 @@ densely, one for each region, the loads' once. Quarteroni, Manzoni & Negri, Redu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -286,7 +286,10 @@ def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection
 def _projected(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """V^T A V (m, m) for V (n, m) and a symmetric A (n, n) that is empty but for some rows and columns."""
     touched, m = np.flatnonzero(np.diff(matrix.indptr)), vectors.shape[1]
-    within, rows = matrix[touched][:, touched], vectors[touched]
+    number = np.zeros(len(vectors), dtype=matrix.indices.dtype)  # of each row among those
+    number[touched] = np.arange(len(touched))
+    ends, shape = np.append(matrix.indptr[touched], matrix.nnz), (len(touched), len(touched))
+    within, rows = sparse.csr_matrix((matrix.data, number[matrix.indices], ends), shape=shape), vectors[touched]
     parts = [slice(start, start + CHUNK) for start in range(0, m, CHUNK)]
     products = mapped(lambda part: rows.T @ np.asarray(within @ np.ascontiguousarray(rows[:, part])), parts)
     projected = np.concatenate(products, axis=1)
@@ -304,26 +307,32 @@ def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
     if snapshots.ndim != 2 or not np.all(np.isfinite(lengths)) or not np.any(lengths > 0.0):
         raise ConfigurationError(f"a reduced basis needs finite, non-zero snapshots (n, k); got {snapshots.shape}")
     moving = np.flatnonzero(lengths)
-    scaled = np.array(snapshots) if len(moving) == len(lengths) else np.take(snapshots, moving, axis=1)
-    scaled /= lengths[moving]
-    parts = [scaled[start : start + ROWS] for start in range(0, len(scaled), ROWS)]
-    gram = _gram(parts)
+    vectors = snapshots if len(moving) == len(lengths) else np.take(snapshots, moving, axis=1)
+    scale, found = 1.0 / lengths[moving], np.empty(vectors.shape)
+    gram = scale[:, None] * _gram(vectors) * scale
     sizes = np.linalg.eigvalsh(gram)
     if sizes[0] > WELL_CONDITIONED * sizes[-1]:
         for again in (False, True):
             # V R^-1 in place of V, with V^T V = R^T R: a second copy would be among the largest there are
-            factor = linalg.cholesky(_gram(parts) if again else gram, check_finite=False)
+            factor = linalg.cholesky(_gram(found) if again else gram, check_finite=False)
             inverse = linalg.solve_triangular(factor, np.eye(len(factor)), check_finite=False)
-            mapped(lambda pair: np.copyto(pair[0], pair[0] @ pair[1]), [(part, inverse) for part in parts])
-        return scaled
-    q, r = np.linalg.qr(scaled)
+            given, by = (found, inverse) if again else (vectors, scale[:, None] * inverse)
+            pairs = zip(_parts(given), _parts(found), strict=True)
+            mapped(lambda item: np.copyto(item[1], item[0] @ item[2]), [(*pair, by) for pair in pairs])
+        return found
+    q, r = np.linalg.qr(scale * vectors)
     rotation, values, _ = np.linalg.svd(r)
     return np.asarray(q @ rotation[:, : int(np.sum(values > RANK_TOLERANCE * values[0]))])
 
 
-def _gram(parts: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """V^T V (m, m) of a V that is given by its rows, part after part."""
-    return np.asarray(np.sum(mapped(lambda part: part.T @ part, parts), axis=0))
+def _parts(vectors: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Rows of vectors (n, m), some at once."""
+    return [vectors[start : start + ROWS] for start in range(0, len(vectors), ROWS)]
+
+
+def _gram(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """V^T V (m, m) of vectors V (n, m)."""
+    return np.asarray(np.sum(mapped(lambda part: part.T @ part, _parts(vectors)), axis=0))
 
 
 def _checked(model: LinearModel, snapshots: NDArray[np.float64]) -> NDArray[np.float64]:

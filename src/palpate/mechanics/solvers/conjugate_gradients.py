@@ -13,7 +13,7 @@ from palpate.errors import SolverError
 from palpate.parallel import mapped, processors
 
 WORTH_THREADS = 3_000_000  # products; below, handing them to a thread takes longer than it spares
-ROOM = 2**28  # bytes of the vectors of columns that are iterated together
+ROOM = 2**29  # bytes of the vectors of columns that are iterated together
 VECTORS = 8  # that a column takes
 FEWEST = 32  # columns together, below which products with a factor are slow
 
