@@ -132,7 +132,7 @@ def _from_far_off(finite: Inversion, linear: Inversion, settings: InversionSetti
         minimum=replace(linear.minimum, unknowns=unknowns),
     )
     moved = replace(linear, candidates=(replace(best, iterate=iterate),), best=0, starts=())
-    return continue_at_finite_strain(moved, settings, progress=_silent)
+    return continue_at_finite_strain(moved, settings.bounds, progress=_silent)
 
 
 def _errors(inversion: Inversion, scene: Scene) -> Result:

@@ -107,7 +107,8 @@ def plain_estimate(
     problem: InverseProblem, settings: InversionSettings, *, progress: Callable[[str], None]
 ) -> OuterIterate:
     """The estimate from where the program begins, the full model solved with all its derivatives at every place."""
-    still, bounds = settings.centre(problem), settings.bounds
+    still = np.concatenate([settings.centre, np.zeros(problem.parameters.n_coefficients)])
+    bounds = settings.bounds
     objective = with_first_noise(_exact(Objective(problem.states, problem.parameters), still)).rematched(still)
     filled = fit_coefficients(objective, still)
     start = begun(_exact(objective, filled.unknowns), filled.unknowns)  # at rest no modulus shows

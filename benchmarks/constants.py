@@ -135,8 +135,7 @@ def _starts(shift: float, case: Posed) -> Iterator[Posed]:
 @contextmanager
 def _begin(shift: float, case: Posed) -> Iterator[Posed]:
     """The case with one start alone, all log-moduli shifted from where it would begin."""
-    n = case.problem.parameters.n_parameters
-    start = case.settings.centre(case.problem)[:n] + shift
+    start = case.settings.centre + shift
     yield replace(case, settings=replace(case.settings, starts=(start,), further=()))
 
 

@@ -22,9 +22,9 @@ STAGES = {  # functions whose time, with all that they call, is a stage of its o
     "wall modes": ("prescribed_motion.py", "prescribed_motion"),
     "stiffness assembled": ("linear_model.py", "linear_model"),
     "finite-strain model": ("finite_strain.py", "finite_strain_model"),
-    "responses and series": ("informed_subspace.py", "informed_objective"),
+    "responses and series": ("informed_subspace.py", "informed_start"),
     "linear estimate": ("candidates.py", "from_starts"),
-    "finite-strain estimate": ("estimate.py", "continue_at_finite_strain"),
+    "finite-strain estimate": ("continuation.py", "continue_at_finite_strain"),
     "intervals and fits": ("estimation.py", "conclude"),
     "what would change the answer": ("variations.py", "what_would_change"),
 }

@@ -265,10 +265,10 @@ def test_starts_that_lead_elsewhere_are_followed_the_best_first_and_others_say_t
     twins, voxels, monkeypatch
 ):
     """Four minima of the cheapest model, told to lie apart: the first one's, two that are followed, one that is not."""
-    screened = candidates._screened
+    screened = candidates.cheapest_minima
 
-    def apart(first, settings, progress):
-        here, *_ = screened(first, settings, progress)
+    def apart(*of):
+        here, *_ = screened(*of)
         ways = [np.append([w, w], np.zeros(len(here.unknowns) - 2)) for w in (0.0, 1.5, -1.5, 3.0)]
         values = [replace(here.evaluation, value=here.evaluation.value + k) for k in (0.0, 2.0, 1.0, 3.0)]
         return [replace(here, unknowns=here.unknowns + w, evaluation=v) for w, v in zip(ways, values, strict=True)]
@@ -279,7 +279,7 @@ def test_starts_that_lead_elsewhere_are_followed_the_best_first_and_others_say_t
         followed.append((named["title"], start.minimum.unknowns[:2]))
         return follow(start, *of, **named)
 
-    monkeypatch.setattr(candidates, "_screened", apart)
+    monkeypatch.setattr(candidates, "cheapest_minima", apart)
     monkeypatch.setattr(candidates, "minimised", noted)
     found = invert(voxels, twins.settings(0.5, 1.0, 2.0, 4.0), progress=twins.silent)
     assert [title for title, _ in followed if title.startswith("start")] == ["start 3", "start 2"]

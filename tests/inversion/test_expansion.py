@@ -10,7 +10,7 @@ import pytest
 
 from palpate.approximation import expansion
 from palpate.errors import EstimationError, NotConverged, SolverError
-from palpate.inversion import Outcome, continue_at_finite_strain, estimate, invert
+from palpate.inversion import Outcome, continuation, continue_at_finite_strain, invert
 from palpate.inversion.candidates import Candidate
 from palpate.inversion.trust_region import NEAR
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
@@ -70,9 +70,9 @@ def ended(twins, linear, settings):
     @cache
     def with_few(few):
         with pytest.MonkeyPatch.context() as patch:
-            around = estimate.expansion_around
-            patch.setattr(estimate, "expansion_around", lambda *of, **named: replace(around(*of, **named), few=few))
-            return continue_at_finite_strain(linear, settings, progress=twins.silent)
+            around = continuation.expansion_around
+            patch.setattr(continuation, "expansion_around", lambda *of, **named: replace(around(*of, **named), few=few))
+            return continue_at_finite_strain(linear, settings.bounds, progress=twins.silent)
 
     return with_few
 
@@ -151,7 +151,7 @@ def test_a_motion_without_equilibrium_ends_the_estimate_where_it_is_the_best_one
     best = linear.candidates[linear.best]
     lost = replace(best, iterate=under(failing(body[2], NotConverged("folded")), best.iterate))
     with pytest.raises(NotConverged, match="folded"):
-        continue_at_finite_strain(replace(linear, candidates=(lost,)), settings, progress=twins.silent)
+        continue_at_finite_strain(replace(linear, candidates=(lost,)), settings.bounds, progress=twins.silent)
 
 
 FAILURES = {
@@ -173,7 +173,7 @@ def test_secondary_minima_that_fail_do_not_end_a_good_estimate(twins, body, line
     starts = (linear.starts[0], *(replace(linear.starts[1], candidate=k) for k in (1, 2, 3)))
     said = list[str]()
     several = replace(linear, candidates=(first, *others), starts=starts)
-    found = continue_at_finite_strain(several, settings, progress=said.append)
+    found = continue_at_finite_strain(several, settings.bounds, progress=said.append)
     assert all(any(str(failure) in line for line in said) for failure in FAILURES)
     assert found.minimum.converged
     assert np.abs(found.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
@@ -188,7 +188,7 @@ def test_starts_that_merge_under_the_law_of_the_case_are_one_candidate(twins, li
     elsewhere = replace(first.iterate, minimum=replace(first.minimum, unknowns=away))
     starts = (linear.starts[0], replace(linear.starts[1], candidate=1))
     both = replace(linear, candidates=(first, Candidate(elsewhere, first.value + 1.0)), starts=starts)
-    found = continue_at_finite_strain(both, settings, progress=twins.silent)
+    found = continue_at_finite_strain(both, settings.bounds, progress=twins.silent)
     assert len(found.candidates) == 1
     assert [start.candidate for start in found.starts] == [0, 0]
     assert np.abs(found.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3

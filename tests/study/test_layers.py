@@ -11,7 +11,7 @@ import pytest
 
 from palpate.errors import NotConverged
 from palpate.inversion import InverseProblem, LaterState, Outcome, invert, minimised
-from palpate.inversion.estimate import with_released
+from palpate.inversion.continuation import with_released
 from palpate.inversion.trust_region import NEAR
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
@@ -165,11 +165,11 @@ def test_an_estimate_that_cannot_be_followed_with_layers_free_says_so(held, twin
     """At first, or where it is likelier so: it is the one with layers held, and no such thing passes for settled."""
     calls = count()
     monkeypatch.setattr(
-        sys.modules["palpate.inversion.estimate"],
+        sys.modules["palpate.inversion.continuation"],
         "minimised",
         lambda *a, **o: ending(*a, **o) if next(calls) == followed else minimised(*a, **o),
     )
-    found = with_released(held, twins.settings(2.0), progress=twins.silent, rule=NEAR)
+    found = with_released(held, twins.settings(2.0).bounds, progress=twins.silent, rule=NEAR)
     assert found.minimum is held.minimum
     assert found.unsettled == ("no equilibrium" if ending is lost else Outcome.STEPS.value)
     assert (found.released is None) == (ending is lost and followed == 0)

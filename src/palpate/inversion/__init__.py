@@ -1,10 +1,10 @@
 """The inverse problem: from later states and what is observed of them to the moduli that explain them."""
 
 from palpate.inversion.candidates import Inversion as Inversion
-from palpate.inversion.candidates import InversionSettings as InversionSettings
 from palpate.inversion.candidates import StartRun as StartRun
 from palpate.inversion.candidates import as_good as as_good
-from palpate.inversion.estimate import continue_at_finite_strain as continue_at_finite_strain
+from palpate.inversion.continuation import continue_at_finite_strain as continue_at_finite_strain
+from palpate.inversion.estimate import InversionSettings as InversionSettings
 from palpate.inversion.estimate import first_noise_of as first_noise_of
 from palpate.inversion.estimate import invert as invert
 from palpate.inversion.frozen_posterior import FixedCorrespondence as FixedCorrespondence

@@ -9,38 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.inversion.frozen_posterior import cheapest_minima
-from palpate.inversion.later_state import InverseProblem
 from palpate.inversion.objective import AS_GOOD, Evaluation, Objective
-from palpate.inversion.optimise import Bounds, Minimum, same_minimum
+from palpate.inversion.optimise import Bounds, Minimum, grouped, same_minimum
 from palpate.inversion.trust_region import NEAR, Convergence, OuterIterate, StopRule, begun, minimised, with_fewest
 from palpate.mechanics.forward import SolveCounts
 from palpate.progress import Progress, silent
 
 COMPARED = replace(NEAR, correlate=False)  # the numbers of independent residuals stay: objectives are compared
 FOLLOWED = 2  # minima of starts beside the first one, the best
-
-
-@dataclass(frozen=True, slots=True)
-class InversionSettings:
-    """Starts theta (n_parameters,) each, and their bounds; the first minimum is sought from their `centre`."""
-
-    starts: tuple[NDArray[np.float64], ...]
-    bounds: Bounds
-    further: tuple[NDArray[np.float64], ...] = ()
-
-    @property
-    def every_start(self) -> tuple[NDArray[np.float64], ...]:
-        """All starts (n_parameters,), the further ones last."""
-        return self.starts + self.further
-
-    def centre(self, problem: InverseProblem) -> NDArray[np.float64]:
-        """Unknowns (n_unknowns,) at the middle of the bounds, or at the end of the starts' range nearest to it.
-
-        Nothing else acts there. Two sets of starts about it are judged from one minimum, of one problem.
-        """
-        starts, theta = np.stack(self.starts), 0.5 * (self.bounds.lower + self.bounds.upper)
-        theta = np.clip(theta, starts.min(axis=0), starts.max(axis=0))
-        return np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,30 +79,35 @@ class Inversion:
 
 
 def from_starts(
-    objective: Objective,
-    begin: NDArray[np.float64],
-    settings: InversionSettings,
+    start: OuterIterate,
+    starts: Sequence[NDArray[np.float64]],
+    bounds: Bounds,
     *,
     rule: StopRule | None,
     progress: Progress,
 ) -> Inversion:
     """The minima that all starts lead to: each on the cheapest model, the best ones followed on the objective's own.
 
-    objective: as it is at rest; begin (n_unknowns,): where the first minimum is sought. rule: when the best one ends,
-    and others that are as good; None: all end near, as the start of another law. Raises as `invert` does.
+    start: where the first minimum is sought; starts: theta (n_parameters,) each. rule: when the best one ends, and
+    others that are as good; None: all end near, as the start of another law. Raises as `invert` does.
     """
-    n, bounds, rest = objective.n_parameters, settings.bounds, objective(np.zeros(objective.parameters.n_unknowns))
-    first = minimised(begun(objective, begin), bounds, NEAR, progress=progress, title="the first minimum")
-    screened = _screened(first, settings, progress)
+    n, nothing = start.objective.n_parameters, np.zeros(len(start.minimum.unknowns))
+    rest = start.objective.rematched(nothing)(nothing)
+    first = minimised(start, bounds, NEAR, progress=progress, title="the first minimum")
+    progress(f"{len(starts)} starts, with the closest points of the first minimum")
+    del start
+    at = first.minimum
+    begins = [np.concatenate([theta, at.unknowns[n:]]) for theta in starts]
+    screened = cheapest_minima(first.objective, at.unknowns, at.evaluation, begins, bounds)
     ends, groups = [first], grouped(screened, n)
-    belongs = {groups[i]: 0 for i, m in enumerate(screened) if same_minimum(m.unknowns, first.minimum, n)}
+    belongs = {groups[i]: 0 for i, m in enumerate(screened) if same_minimum(m.unknowns, at, n)}
     for number in sorted(range(len(screened)), key=lambda i: screened[i].evaluation.value):
         if len(ends) <= FOLLOWED and groups[number] not in belongs and screened[number].converged:
-            start, belongs[groups[number]] = begun(first.objective, screened[number].unknowns), len(ends)
-            ends.append(minimised(start, bounds, COMPARED, progress=progress, title=f"start {number + 1}"))
-    pairs = zip(settings.every_start, screened, groups, strict=True)
-    starts = tuple(StartRun(theta, minimum, belongs.get(group)) for theta, minimum, group in pairs)
-    found = concluded(ends, starts, rest, bounds, 0)
+            belongs[groups[number]], begin = len(ends), begun(first.objective, screened[number].unknowns)
+            ends.append(minimised(begin, bounds, COMPARED, progress=progress, title=f"start {number + 1}"))
+    pairs = zip(starts, screened, groups, strict=True)
+    runs = [StartRun(theta, minimum, belongs.get(group)) for theta, minimum, group in pairs]
+    found = concluded(ends, runs, rest, bounds, 0)
     evaluations = 1 + sum(end.minimum.evaluations for end in ends) + found.evaluations
     counts = sum((end.counts - first.counts for end in ends[1:]), first.counts)
     if rule is not None:
@@ -143,14 +124,6 @@ def from_starts(
     return replace(found, evaluations=evaluations, counts=counts)
 
 
-def _screened(first: OuterIterate, settings: InversionSettings, progress: Progress) -> list[Minimum]:
-    """A minimum from every start on the cheapest model: closest points and hyper-parameters as at a first minimum."""
-    at, n = first.minimum, first.objective.n_parameters
-    progress(f"{len(settings.every_start)} starts, with the closest points of the first minimum")
-    begins = [np.concatenate([theta, at.unknowns[n:]]) for theta in settings.every_start]
-    return cheapest_minima(first.objective, at.unknowns, at.evaluation, begins, settings.bounds)
-
-
 def as_good(value: float, best: float, *, scale: float = 1.0) -> bool:
     """Whether a minimum of a `value` of minus the log posterior is as likely as one of `best`, as far as data can say.
 
@@ -162,7 +135,7 @@ def as_good(value: float, best: float, *, scale: float = 1.0) -> bool:
 
 def concluded(
     followed: Sequence[OuterIterate],
-    starts: tuple[StartRun, ...],
+    starts: Sequence[StartRun],
     rest: Evaluation,
     bounds: Bounds,
     first: int,
@@ -175,7 +148,8 @@ def concluded(
         """A minimum is stood for by the one sought first, else by one that converged."""
         return i != first, not followed[i].minimum.converged, i
 
-    distinct = [followed[min(members(groups, group), key=rank)] for group in range(max(groups) + 1)]
+    of_group = [[i for i, of in enumerate(groups) if of == group] for group in range(max(groups) + 1)]
+    distinct = [followed[min(own, key=rank)] for own in of_group]
     values, evaluations = compared(distinct, bounds)
     candidates = tuple(Candidate(iterate, value) for iterate, value in zip(distinct, values, strict=True))
     usable = [c.value if c.minimum.converged else np.inf for c in candidates]
@@ -199,20 +173,3 @@ def compared(distinct: Sequence[OuterIterate], bounds: Bounds) -> tuple[list[flo
         values.append(end.objective.total(end.minimum.evaluation))
         evaluations += end.minimum.evaluations
     return values, evaluations
-
-
-def grouped(minima: Sequence[Minimum], n_parameters: int) -> list[int]:
-    """Number of the distinct minimum that each one is, in their order."""
-    distinct: list[Minimum] = []
-    groups = []
-    for minimum in minima:
-        same = [i for i, other in enumerate(distinct) if same_minimum(minimum.unknowns, other, n_parameters)]
-        if not same:
-            distinct.append(minimum)
-        groups.append(same[0] if same else len(distinct) - 1)
-    return groups
-
-
-def members(groups: Sequence[int], group: int) -> list[int]:
-    """Numbers of those that belong to a group."""
-    return [i for i, of in enumerate(groups) if of == group]

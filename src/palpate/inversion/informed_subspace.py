@@ -17,7 +17,7 @@ from palpate.approximation.reduced_basis import SNAPSHOT, ReducedBasis, basis_of
 from palpate.inversion.hyper_parameters import with_first_noise
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import Objective
-from palpate.inversion.trust_region import fit_coefficients
+from palpate.inversion.trust_region import OuterIterate, begun, fit_coefficients
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
@@ -26,31 +26,28 @@ from palpate.progress import Progress
 from palpate.unknowns.blocks import Acts, Block
 
 
-def at_rest(objective: Objective) -> Objective:
-    """The objective before any residual is seen, with what belongs together where nothing has moved."""
-    return with_first_noise(objective).rematched(np.zeros(objective.parameters.n_unknowns))
+def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progress: Progress) -> OuterIterate:
+    """Where the first minimum is sought, at theta (n_parameters,), in what the images tell of the problem's blocks.
 
-
-def informed_objective(
-    problem: InverseProblem, begin: NDArray[np.float64], *, progress: Progress
-) -> tuple[Objective, NDArray[np.float64], int]:
-    """The objective at rest on what the images tell of its blocks, by the full models' responses at `begin` (n,).
-
-    Its states have reduced bases of these. With it come its unknowns (n_unknowns,) of `begin`, the boundary's motion
-    fitted, and the evaluations spent. Raises as `invert` does.
+    States that bring an approximation keep it and all unknowns, at which nothing moves. For the others the full models'
+    responses tell, at the boundary's motion that fits there; reduced bases are made of these. Raises as `invert` does.
     x of a block with the widest covariance C = L L^T is seen along the eigenvectors of L^T A L, A = J^T W J its
     information: an eigenvalue l is the variance that x may explain along one over that of the noise, and what is left
     out widens the posterior by a share of less than its sum (Spantini et al. 2015, SIAM J. Sci. Comput. 37, A2451,
     Theorem 2.3; Cui et al. 2014, Inverse Problems 30, 114015). Noise is that before residuals are seen, which is small.
     """
     parameters, states, found = problem.parameters, list[LaterState](), list[_Responses]()
-    for number, state in enumerate(problem.states, start=1):
-        progress(f"responses of the full model at the bounds' middle, state {number} of {len(problem.states)}")
+    begin = np.concatenate([theta, np.zeros(parameters.n_coefficients)])
+    start = with_first_noise(Objective(problem.states, parameters))
+    if all(state.approximation for state in start.states):
+        return begun(start, begin)
+    for number, state in enumerate(start.states, start=1):
+        progress(f"responses of the full model at the bounds' middle, state {number} of {len(start.states)}")
         system = state.model.system(parameters.moduli(begin))
         found.append(_Responses(system, system.single_responses(tolerance=SNAPSHOT)))
         states.append(replace(state, observed=found[-1].seen(state, np.zeros(state.model.n_modes))))
     progress("the motion of walls and frame there")
-    objective = with_first_noise(Objective(tuple(states), parameters)).rematched(begin)
+    objective = replace(start, states=tuple(states)).rematched(begin)
     fitted = fit_coefficients(objective, begin)
     progress("what the images tell of all unknowns there")
     for s, (state, q) in enumerate(zip(objective.states, parameters.coefficients(fitted.unknowns), strict=True)):
@@ -65,11 +62,11 @@ def informed_objective(
         informed_combinations(b, data[np.ix_(own, own)]) for b, own in zip(parameters.blocks, columns, strict=True)
     ]
     fit = [inverse @ middle[own] for own, (_, inverse) in zip(columns, bases, strict=True)]
-    unknowns = np.concatenate([middle[: parameters.n_parameters], *fit])
+    unknowns = np.concatenate([theta, *fit])
     blocks = tuple(b.combined(inverse) for b, (_, inverse) in zip(parameters.blocks, bases, strict=True))
     seen, informed = replace(parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0))), list[LaterState]()
     progress(f"how the responses to {seen.n_coefficients} unknowns that are seen change with the moduli")
-    for s, (state, q) in enumerate(zip(problem.states, seen.coefficients(unknowns), strict=True)):
+    for s, (state, q) in enumerate(zip(start.states, seen.coefficients(unknowns), strict=True)):
         of_state = [(b.acts, basis) for b, (basis, _) in zip(parameters.blocks, bases, strict=True) if s in b.states]
         boundary, material = (
             linalg.block_diag(np.zeros((0, 0)), *(basis for acts, basis in of_state if acts is wanted))
@@ -80,7 +77,7 @@ def informed_objective(
         reduced = state.combined(boundary, fields)
         basis = found.pop(0).combined(reduced.model, boundary, material)
         informed.append(reduced.with_approximation(basis.with_modulus_series(q, seen.derivatives(unknowns))))
-    return at_rest(Objective(tuple(informed), seen)), unknowns, evaluations
+    return begun(Objective(tuple(informed), seen), unknowns, evaluations=evaluations)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -151,6 +152,18 @@ def same_minimum(unknowns: NDArray[np.float64], minimum: Minimum, n_parameters: 
     """
     width = np.maximum(SAME_MINIMUM, posterior_sd(minimum, n_parameters))
     return bool(np.all(np.abs(unknowns - minimum.unknowns)[:n_parameters] < width))
+
+
+def grouped(minima: Sequence[Minimum], n_parameters: int) -> list[int]:
+    """Number of the distinct minimum that each one is, in their order."""
+    distinct: list[Minimum] = []
+    groups = []
+    for minimum in minima:
+        same = [i for i, other in enumerate(distinct) if same_minimum(minimum.unknowns, other, n_parameters)]
+        if not same:
+            distinct.append(minimum)
+        groups.append(same[0] if same else len(distinct) - 1)
+    return groups
 
 
 def gauss_newton(

@@ -12,6 +12,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation.contract import Approximation
+from palpate.approximation.expansion import Expansion
 from palpate.errors import NotConverged
 from palpate.inversion.hyper_parameters import with_correlations, with_hyper_parameters
 from palpate.inversion.objective import AS_GOOD, Evaluation, LinearisedObjective, Objective
@@ -27,6 +29,7 @@ from palpate.inversion.optimise import (
     newton_step,
     posterior_sd,
 )
+from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.contract import seen_by
 from palpate.progress import silent
@@ -94,6 +97,7 @@ class StopRule:
         return np.maximum(self.step_sd * posterior_sd(minimum, n_parameters), self.floor)
 
 
+REPORTED = StopRule()
 NEAR = StopRule(step_sd=0.2)  # of a start that is followed further, and of an interval: a tenth of its half-width
 
 
@@ -118,13 +122,29 @@ class OuterIterate:
         """What the full model has cost: to make the approximations, and to state their errors."""
         return sum((approximation.counts for approximation in self.objective.approximations), self.checks)
 
+    def at_equilibrium(self) -> OuterIterate:
+        """The same at exact equilibria of its expansions."""
+        exact, at = list[Approximation](), self.minimum
+        points = self.objective.linearisation_points(at.unknowns)
+        for approximation, point in zip(self.objective.approximations, points, strict=True):
+            assert isinstance(approximation, Expansion)
+            exact.append(approximation.at_equilibrium(point, tolerance=ACCURACY))
+        objective = self.objective.under(exact)
+        minimum = replace(at, evaluation=objective(at.unknowns), evaluations=at.evaluations + 1)
+        return replace(self, objective=objective, minimum=minimum)
 
-def begun(objective: Objective, unknowns: NDArray[np.float64], *, history: tuple[Iterate, ...] = ()) -> OuterIterate:
-    """Where a loop begins: an objective matched, and evaluated, at unknowns (n_unknowns,); `history`: the way there."""
+
+def begun(
+    objective: Objective, unknowns: NDArray[np.float64], *, history: tuple[Iterate, ...] = (), evaluations: int = 0
+) -> OuterIterate:
+    """Where a loop begins: an objective matched, and evaluated, at unknowns (n_unknowns,).
+
+    history, evaluations: the way there, and what it cost.
+    """
     objective = objective.rematched(unknowns)
     evaluation = objective(unknowns)
     history = (*history, Iterate.of(unknowns, evaluation, objective.n_parameters))
-    return OuterIterate(objective, Minimum(unknowns, evaluation, Outcome.STEPS, history, 1))
+    return OuterIterate(objective, Minimum(unknowns, evaluation, Outcome.STEPS, history, evaluations + 1))
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
 from palpate.inversion import InverseProblem, Inversion, InversionSettings, StopRule, invert
-from palpate.inversion.estimate import REPORTED
+from palpate.inversion.trust_region import REPORTED
 from palpate.mechanics.rest_state import unloaded_displacement
 from palpate.progress import Progress, during
 from palpate.study.body import Body, joint_problem, strained_body

@@ -101,7 +101,7 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
     noise_of = error_noise(nearby.evaluation)
     progress("the information of the images at the guessed moduli")
     guess, stated = nearby.unknowns.copy(), {tissue.name: tissue.modulus_kpa for tissue in case.tissues}
-    guess[: objective.n_parameters] = settings.centre(problem)[: objective.n_parameters]
+    guess[: objective.n_parameters] = settings.centre
     for i, name in enumerate(objective.parameters.tissues):
         if (kpa := stated.get(name)) is not None:
             guess[i] = float(np.log(kpa / objective.parameters.scale_kpa))
