@@ -124,15 +124,13 @@ class ReducedBasis:
 
         Of its parts, too, that follow the material modes.
         """
-        model, homogeneous = self.full_model, self._homogeneous(at)
+        model, displacement = self.full_model, self._homogeneous(at)
         material = at.coefficients[model.constraint.n_modes :, None]
         if not np.any(material):
-            return ModelError(*self.system.error_bound(at.moduli, homogeneous))
-        forces = model.material_forces(at.moduli, homogeneous, material)
-        forces = forces + model.forces(at.moduli, self.model.output_material @ material)
-        return ModelError(
-            *self.system.error_bound(at.moduli, homogeneous, np.asarray(model.constraint.free.T @ forces))
-        )
+            return ModelError(*self.system.error_bound(at.moduli, displacement))
+        forces = model.material_forces(at.moduli, displacement, material)
+        whole = displacement + (self.model.output_material @ material)[:, 0]
+        return ModelError(*self.system.error_bound(at.moduli, whole, np.asarray(model.constraint.free.T @ forces)))
 
     def with_material(self, responses: NDArray[np.float64], moduli: NDArray[np.float64]) -> ReducedBasis:
         """With the responses (n_dof, n_material) mm to the material modes at moduli (n_regions,) kPa."""

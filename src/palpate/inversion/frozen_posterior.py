@@ -19,6 +19,7 @@ from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.reduced import ReducedModel
+from palpate.parallel import mapped
 
 ONE = np.ones(1)  # the coordinate of what no unknown moves
 
@@ -245,7 +246,7 @@ def cheapest_minima(
         cheapest: LeastSquares = frozen_posterior(objective, unknowns, evaluation)
     except ConfigurationError:
         cheapest = fixed_correspondence(objective, unknowns, evaluation)
-    return [gauss_newton(cheapest, begin, bounds=bounds, tolerance=AS_GOOD / 200.0) for begin in begins]
+    return mapped(lambda begin: gauss_newton(cheapest, begin, bounds=bounds, tolerance=AS_GOOD / 200.0), begins)
 
 
 def predicted_minimum(objective: Objective, unknowns: NDArray[np.float64], bounds: Bounds) -> NDArray[np.float64]:

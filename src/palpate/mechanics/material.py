@@ -12,6 +12,7 @@ from scipy import sparse
 from palpate.mechanics.hyperelastic import Elements, Moduli
 from palpate.mesh.gaussian_process import karhunen_loeve, matern
 from palpate.mesh.tet_mesh import TetMesh
+from palpate.parallel import mapped, processors
 
 SHARE, SHARE_OF_MAP = 0.95, 0.9995  # of the variance of a tissue's ln E that its modes hold, and of one that is mapped
 MOST = 120  # modes of a tissue that is not mapped
@@ -104,12 +105,17 @@ class MaterialForces:
 
     def along(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """G d (n_dof, k) for directions d (n_modes, k)."""
-        total, start = np.zeros((self.n_dof, directions.shape[1])), 0
-        for scatter, amounts in self.parts:
-            end = start + amounts.shape[1]
-            total += scatter @ np.asarray(amounts @ directions[start:end])
-            start = end
-        return total
+
+        def some(part: NDArray[np.float64]) -> NDArray[np.float64]:
+            """Along some of them."""
+            total, start = np.zeros((self.n_dof, part.shape[1])), 0
+            for scatter, amounts in self.parts:
+                end = start + amounts.shape[1]
+                total += scatter @ np.asarray(amounts @ part[start:end])
+                start = end
+            return total
+
+        return np.concatenate(mapped(some, np.array_split(directions, processors(), axis=1)), axis=1)
 
     def work(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
         """G^T p (n_modes,), mN mm, of the forces along p (n_dof,) mm."""

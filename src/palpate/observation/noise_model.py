@@ -227,12 +227,19 @@ def _pair_sums(
 
     values (n_cells,) mm, centres (n_cells, 3) mm, normals (n_cells, 3). A pair counts twice.
     """
-    i, j = cKDTree(centres).query_pairs(between[1], output_type="ndarray").T
-    apart = np.linalg.norm(centres[i] - centres[j], axis=1)
-    i, j, apart = (of[apart >= between[0]] for of in (i, j, apart))
-    cosine, count = np.einsum("na,na->n", normals[i], normals[j]), counts[i] * counts[j]
+    i, j = np.ascontiguousarray(cKDTree(centres).query_pairs(between[1], output_type="ndarray").T)
+    apart = _apart(centres, i, j)
+    if between[0]:
+        i, j, apart = (of[apart >= between[0]] for of in (i, j, apart))
+    cosine = np.sum([n[i] * n[j] for n in np.ascontiguousarray(normals.T)], axis=0)
+    bins, count = _bins(apart), counts[i] * counts[j]
     terms = (values[i] * values[j] * cosine, cosine**2, apart, np.ones_like(apart))
-    return np.stack([2.0 * np.bincount(_bins(apart), count * term, minlength=BINS)[:BINS] for term in terms])
+    return np.stack([2.0 * np.bincount(bins, count * term, minlength=BINS)[:BINS] for term in terms])
+
+
+def _apart(places: NDArray[np.float64], i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Distances (n,) mm of pairs i, j (n,) of places (n_places, 3) mm; axis by axis, which takes half of the time."""
+    return np.asarray(np.sqrt(sum((x[i] - x[j]) ** 2 for x in np.ascontiguousarray(places.T))))
 
 
 def _cell_means(places: NDArray[np.float64], size: float) -> sparse.csr_matrix[np.float64]:
@@ -291,8 +298,7 @@ def _correlated(
 ) -> NDArray[np.float64]:
     """Sum over axes of A K A^T (n_rows, n_rows), A = `carried` (n_rows, n_cells), cells at centres (n_cells, 3) mm."""
     i, j = cKDTree(centres).query_pairs(CUTOFF * length, output_type="ndarray").T
-    apart = np.sqrt(sum((x[i] - x[j]) ** 2 for x in np.ascontiguousarray(centres.T)))
-    once = sparse.coo_matrix((_gaussian(apart, length), (i, j)), shape=(len(centres),) * 2)
+    once = sparse.coo_matrix((_gaussian(_apart(centres, i, j), length), (i, j)), shape=(len(centres),) * 2)
     parts = [(part @ _times(once, part.T), part @ part.T) for part in carried]
     return np.asarray(sum((across + across.T + own for across, own in parts), np.zeros(())))
 
