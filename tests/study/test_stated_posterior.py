@@ -51,10 +51,27 @@ def ends(posterior, bounds):
     return np.array([[of.low, of.high] for of in profiles(posterior, bounds)], dtype=np.float64)
 
 
-def test_profiles_end_where_those_of_the_full_model_do(inversion, poor, bounds):
-    """A tenth of the half-width off at the most; those of a basis that was not asked there are further off."""
-    before = posterior_of(poor, inversion.minimum)
-    found, full = exact_at_ends(before, poor, bounds), poor
+@pytest.fixture(scope="module")
+def expansion(inversion, twin):
+    """The linear law to first order around the estimate."""
+    return exact_approximation(
+        twin.model, None, inversion.objective.linearisation_points(inversion.minimum.unknowns)[0]
+    )
+
+
+@pytest.fixture(scope="module", params=["itself", "bending an expansion"])
+def on_poor(request, poor, expansion):
+    """The objective on the poor basis, or on an expansion that bends as that does: of one law they are the same."""
+    if request.param == "itself":
+        return poor
+    (state,) = poor.under([expansion]).states
+    return replace(poor, states=(replace(state, bending=poor.approximations[0]),))
+
+
+def test_profiles_end_where_those_of_the_full_model_do(inversion, poor, on_poor, bounds):
+    """A tenth of the half-width off at the most; lower ends of a basis that was not asked there are further off."""
+    before = posterior_of(on_poor, inversion.minimum)
+    found, full = exact_at_ends(before, on_poor, bounds), poor
     for of in profiles(found, bounds):
         for place in of.outermost:
             at, (model,) = full.linearisation_points(place)[0], full.approximations
@@ -62,14 +79,13 @@ def test_profiles_end_where_those_of_the_full_model_do(inversion, poor, bounds):
     half = NORMAL_95 * np.sqrt(np.diag(found.covariance)[:2])[:, None]
     truth = ends(posterior_of(full, inversion.minimum), bounds)
     off = [np.abs(ends(of, bounds) - truth) / half for of in (before, found)]
-    assert off[0].min() > 0.1
+    assert off[0][:, 0].min() > 0.1
     assert off[1].max() < 0.1
 
 
-def test_an_expansion_is_exact_at_one_place_alone_and_stays(inversion, poor, twin, bounds):
+def test_an_expansion_that_bends_as_no_basis_does_stays(inversion, poor, expansion, bounds):
     before = posterior_of(poor, inversion.minimum)
-    at = poor.linearisation_points(inversion.minimum.unknowns)[0]
-    assert exact_at_ends(before, poor.under([exact_approximation(twin.model, None, at)]), bounds) is before
+    assert exact_at_ends(before, poor.under([expansion]), bounds) is before
 
 
 def test_nothing_is_asked_where_no_minimum_was_found(inversion, poor, bounds):

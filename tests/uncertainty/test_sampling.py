@@ -122,7 +122,7 @@ def test_an_expansion_that_bends_is_frozen_with_its_own_value_far_away(twins, rn
     there = finite_strain_model(twin.model.space, twin.model.constraint, law).solve(moduli, q)
     first = expanded(there, names=twin.model.names, moduli=moduli, coefficients=q)
     (state,) = plain.states
-    bent = replace(plain, states=(replace(state, observed=first.outputs(state.seen), bending=state.observed),))
+    bent = replace(plain, states=(replace(state, observed=first.outputs(state.seen), bending=state.approximation),))
     unknowns = np.concatenate([twins.TRUTH, q])
     bent = bent.rematched(unknowns)
     evaluation = bent(unknowns)

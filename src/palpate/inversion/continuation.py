@@ -112,5 +112,5 @@ def _coarse(linear: OuterIterate) -> tuple[Objective, list[FiniteStrainEquilibri
     for state, basis, point in zip(before.states, before.approximations, points, strict=True):
         assert state.finite_strain is not None
         found.append(coarse_equilibrium(state.finite_strain, basis, point))
-        states.append(replace(state, approximation=None, bending=state.observed))
+        states.append(replace(state, approximation=None, bending=basis))
     return replace(before, states=tuple(states)), found

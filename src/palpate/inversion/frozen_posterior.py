@@ -84,11 +84,13 @@ def fixed_correspondence(
     mapping = objective.parameters
     moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
     for state, q in zip(objective.states, coefficients, strict=True):
-        model, like = state.observed, state.bending
+        model, bending = state.observed, state.bending
         assert model is not None, "an objective is made of states with approximations"
         values = model.solve(moduli, q).values
         displacements += [values[rows] for rows in state.slices]
-        models.append(CurvedModel.of(model, like) if like and isinstance(model, FirstOrderModel) else model)
+        if bending is not None and isinstance(model, FirstOrderModel):
+            model = CurvedModel.of(model, bending.model.outputs(state.seen))
+        models.append(model)
     return FixedCorrespondence(objective, unknowns, tuple(models), evaluation.linearisations, tuple(displacements))
 
 

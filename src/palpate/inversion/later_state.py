@@ -25,8 +25,8 @@ class LaterState:
 
     model: the body under the linear law; finite_strain: under the law that the estimate is continued to, None where
     that is the linear one; reference: number of the rest state that it belongs to; observed: the approximation's model
-    of what is observed alone, one observation after the other; bending: the linear law's one, whose curvature an
-    expansion under another law lacks.
+    of what is observed alone, one observation after the other; bending: the linear law's approximation, whose
+    curvature an expansion under another law lacks.
     """
 
     model: LinearModel
@@ -35,7 +35,7 @@ class LaterState:
     reference: int = 0
     approximation: Approximation | None = field(default=None, repr=False)
     observed: ForwardModel | None = field(default=None, repr=False)
-    bending: ForwardModel | None = field(default=None, repr=False)
+    bending: Approximation | None = field(default=None, repr=False)
 
     @property
     def noise(self) -> dict[str, NoiseModel]:

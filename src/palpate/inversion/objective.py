@@ -205,6 +205,12 @@ class Objective:
         pairs = zip(self.states, approximations, strict=True)
         return replace(self, states=tuple(state.with_approximation(model) for state, model in pairs))
 
+    def bent_as(self, models: Sequence[Approximation]) -> Objective:
+        """The same whose answers far from where it ends are those of other reduced models, one a state."""
+        pairs = zip(self.states, models, strict=True)
+        states = [replace(s, bending=model) if s.bending else s.with_approximation(model) for s, model in pairs]
+        return replace(self, states=tuple(states))
+
     def released(self, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> tuple[Objective, Evaluation]:
         """The objective with those blocks free that were fixed, and its evaluation at unknowns (n_unknowns,)."""
         objective = replace(self, parameters=self.parameters.released())

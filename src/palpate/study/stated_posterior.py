@@ -50,12 +50,15 @@ def exact_at_ends(posterior: StatedPosterior, objective: Objective, bounds: Boun
     """A posterior whose reduced models are exact where its profiles end, far from where the estimate asked for it.
 
     The displacement is added to the basis at the outermost place of every profile, and once more where that moves by a
-    tenth of the half-width. An expansion is exact at one place alone: its posterior stays as it is; so does one whose
-    full model cannot be solved there. objective: that of the posterior, with its models.
+    tenth of the half-width. Of an expansion, exact at one place alone, it is the linear law's basis, as which it bends,
+    and which lacks the derivatives that decide there: they are taken from it. The posterior stays as it is without one,
+    or where its full model cannot be solved there. objective: that of the posterior, with its models.
     """
-    if not posterior.minimum.converged or any(np.isfinite(model.trust_radius) for model in objective.approximations):
+    pairs, least = zip(objective.states, objective.approximations, strict=True), posterior.minimum
+    models = [state.bending or approximation for state, approximation in pairs]
+    if not least.converged or any(np.isfinite(model.trust_radius) for model in models):
         return posterior
-    half, models = NORMAL_95 * np.sqrt(np.diag(posterior.covariance)), objective.approximations
+    half = NORMAL_95 * np.sqrt(np.diag(posterior.covariance))
     known: Mapping[tuple[int, bool], NDArray[np.float64]] = {}
     for _ in range(ROUNDS):
         found = _outermost(posterior, objective.n_parameters, bounds)
@@ -66,12 +69,15 @@ def exact_at_ends(posterior: StatedPosterior, objective: Objective, bounds: Boun
         }
         if not moved:
             break
+        asked = [objective.linearisation_points(x) for x in moved.values()]
+        if not known and any(state.bending for state in objective.states):
+            asked.append(objective.linearisation_points(least.unknowns, least.evaluation, all_material=False))
         try:
-            for x in moved.values():
-                models = [model.update(at) for model, at in zip(models, objective.linearisation_points(x), strict=True)]
+            for points in asked:
+                models = [model.update(at) for model, at in zip(models, points, strict=True)]
         except SolverError:
             break
-        exact = frozen_posterior(objective.under(models), posterior.minimum.unknowns)
+        exact = frozen_posterior(objective.bent_as(models), least.unknowns)
         posterior, known = replace(posterior, frozen=exact), {**known, **moved}
     return posterior
 
