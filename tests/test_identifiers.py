@@ -9,6 +9,7 @@ import json
 import re
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import nibabel
 import nrrd
@@ -193,10 +194,24 @@ def test_no_identifier_of_a_header_is_in_any_output(outputs: dict[str, tuple[Pat
     assert "3,frame,64,96,255,255" in table
 
 
+def leaves(value: Any) -> tuple[list[Any], list[float]]:
+    """What a JSON value holds, in its order: keys, words and whole numbers; and numbers that were computed."""
+    if isinstance(value, float):
+        return [], [value]
+    if not isinstance(value, dict | list):
+        return [value], []
+    parts = [leaves(part) for part in (value.values() if isinstance(value, dict) else value)]
+    keys = [*value] if isinstance(value, dict) else [len(value)]
+    return [*keys, *(w for words, _ in parts for w in words)], [n for _, numbers in parts for n in numbers]
+
+
 def test_no_identifier_of_a_header_is_in_any_output_of_a_cohort(
     folder: Path, outputs: dict[str, tuple[Path, str]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """A row that is estimated, and one that fails over its image; one case has one result, alone and as a row."""
+    """A row that is estimated, and one that fails over its image; one case has one result, alone and as a row.
+
+    To rounding, which hangs on where in memory a process has its arrays.
+    """
     table = folder / "cohort.csv"
     broken = (folder / "before.seg.nrrd").read_bytes()[:600]
     (folder / "broken.seg.nrrd").write_bytes(broken)
@@ -215,7 +230,10 @@ def test_no_identifier_of_a_header_is_in_any_output_of_a_cohort(
         json.loads((place / "result.json").read_text()) for place in (outputs["estimate"][0], output / "cases/good")
     )
     same = ("status", "estimates", "correlation", "fit", "starts", "outer_loop", "counts", "mesh")
-    assert {key: row[key] for key in same} == {key: alone[key] for key in same}
+    for key in same:
+        (words, numbers), (expected, others) = leaves(row[key]), leaves(alone[key])
+        assert words == expected
+        assert numbers == pytest.approx(others, rel=1e-9, abs=1e-12)
     assert (output / "cases/good/report.html").exists()
     assert "cases/good/report.html" in (output / "cohort.html").read_text()
     assert main(["status", str(output)]) == 0

@@ -46,7 +46,7 @@ def case(request, tmp_path_factory):
 
 
 def test_the_default_law_finds_the_moduli_of_a_body_at_finite_strain(case):
-    result = estimate(read_case(case, ["estimate.samples=200"]))
+    result = estimate(read_case(case, ["estimate.samples=1000"]))
     assert (result.case.mechanics.law, result.case.mechanics.element) == ("neo-hookean", "auto")
     assert result.estimation.status == "converged"
     for found in result.estimation.estimates:
