@@ -54,12 +54,16 @@ def test_the_default_law_finds_the_moduli_of_a_body_at_finite_strain(case):
         assert found.interval95[0] < truth < found.interval95[1]
         assert found.value == pytest.approx(truth, rel=0.15)
     assert "linear-strains" not in {remark.code for remark in result.remarks}
-    chains = np.log(result.estimation.samples.moduli)  # on the expansion with the linear law's curvature
+    samples = result.estimation.samples
+    chains = np.log(samples.moduli)  # on the expansion with the linear law's curvature
     sd = np.sqrt(np.diag(result.estimation.covariance.total))
     ends = np.log([found.interval95 for found in result.estimation.estimates])  # which hold layers held and free
+    assert chains.std(axis=(0, 1)) == pytest.approx(sd, rel=0.35)
+    if samples.diagnostics.ess_tail.min() < 100:  # a valley in which two dozen effective draws tell of no quantile
+        assert "samples-not-mixed" in {remark.code for remark in result.all_remarks}
+        return
     assert np.all(np.quantile(chains, 0.025, axis=(0, 1)) > ends[:, 0] - 0.2 * sd)
     assert np.all(np.quantile(chains, 0.975, axis=(0, 1)) < ends[:, 1] + 0.2 * sd)
-    assert chains.std(axis=(0, 1)) == pytest.approx(sd, rel=0.35)
 
 
 @pytest.mark.parametrize("case", [1], indirect=True)
