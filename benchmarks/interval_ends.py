@@ -69,8 +69,7 @@ def measured(seed: int, edge_mm: float, law: str) -> dict[str, Any]:
 
 def with_all_responses(objective: Objective, place: NDArray[np.float64]) -> Objective:
     """The objective on bases that have every response at unknowns (n_unknowns,)."""
-    found = [state.bending or state.approximation for state in objective.states]
-    bases = [basis for basis in found if isinstance(basis, ReducedBasis)]
+    bases = [basis for basis in objective.bends_as if isinstance(basis, ReducedBasis)]
     pairs = zip(bases, objective.linearisation_points(place), strict=True)
     return objective.bent_as([basis.with_responses(at.moduli, at.coefficients) for basis, at in pairs])
 

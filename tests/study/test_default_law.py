@@ -45,7 +45,7 @@ def case(request, tmp_path_factory):
     return folder / "case.toml"
 
 
-def test_the_default_law_finds_the_moduli_of_a_body_at_finite_strain(case):
+def test_the_default_law_finds_the_moduli_of_a_body_at_finite_strain(case, request):
     result = estimate(read_case(case, ["estimate.samples=1000"]))
     assert (result.case.mechanics.law, result.case.mechanics.element) == ("neo-hookean", "auto")
     assert result.estimation.status == "converged"
@@ -59,9 +59,12 @@ def test_the_default_law_finds_the_moduli_of_a_body_at_finite_strain(case):
     sd = np.sqrt(np.diag(result.estimation.covariance.total))
     ends = np.log([found.interval95 for found in result.estimation.estimates])  # which hold layers held and free
     assert chains.std(axis=(0, 1)) == pytest.approx(sd, rel=0.35)
-    if samples.diagnostics.ess_tail.min() < 100:  # a valley in which two dozen effective draws tell of no quantile
+    if (
+        request.node.callspec.params["case"] == 3
+    ):  # a valley: two dozen effective draws tell of no quantile, and it says so
         assert "samples-not-mixed" in {remark.code for remark in result.all_remarks}
         return
+    assert samples.diagnostics.ess_tail.min() > 100
     assert np.all(np.quantile(chains, 0.025, axis=(0, 1)) > ends[:, 0] - 0.2 * sd)
     assert np.all(np.quantile(chains, 0.975, axis=(0, 1)) < ends[:, 1] + 0.2 * sd)
 

@@ -69,7 +69,10 @@ def on_poor(request, poor, expansion):
 
 
 def test_profiles_end_where_those_of_the_full_model_do(inversion, poor, on_poor, bounds):
-    """A tenth of the half-width off at the most; lower ends of a basis that was not asked there are further off."""
+    """A tenth of the half-width off at the most; those of a basis that was not asked there are further off.
+
+    Of an expansion lower ends alone: its own derivatives lead nearly as far upwards.
+    """
     before = posterior_of(on_poor, inversion.minimum)
     found, full = exact_at_ends(before, on_poor, bounds), poor
     for of in profiles(found, bounds):
@@ -79,7 +82,7 @@ def test_profiles_end_where_those_of_the_full_model_do(inversion, poor, on_poor,
     half = NORMAL_95 * np.sqrt(np.diag(found.covariance)[:2])[:, None]
     truth = ends(posterior_of(full, inversion.minimum), bounds)
     off = [np.abs(ends(of, bounds) - truth) / half for of in (before, found)]
-    assert off[0][:, 0].min() > 0.1
+    assert (off[0] if on_poor is poor else off[0][:, 0]).min() > 0.1
     assert off[1].max() < 0.1
 
 

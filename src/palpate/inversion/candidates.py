@@ -95,7 +95,6 @@ def from_starts(
     rest = start.objective.rematched(nothing)(nothing)
     first = minimised(start, bounds, NEAR, progress=progress, title="the first minimum")
     progress(f"{len(starts)} starts, with the closest points of the first minimum")
-    del start
     at = first.minimum
     begins = [np.concatenate([theta, at.unknowns[n:]]) for theta in starts]
     screened = cheapest_minima(first.objective, at.unknowns, at.evaluation, begins, bounds)

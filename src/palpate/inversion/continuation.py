@@ -36,20 +36,18 @@ def continue_at_finite_strain(
     cannot be followed for another reason, is left out of the comparison. rule: when each ends. Raises `NotConverged`
     when the best one's equilibrium is not found, with the element and the share of the motion where it ended.
     """
-    waiting = {number: candidate.iterate for number, candidate in enumerate(linear.candidates)}
-    linear = replace(linear, candidates=())  # and with them their reduced bases, which are large, one by one
     ends, spent, evaluations = dict[int, OuterIterate](), linear.counts, linear.evaluations
-    for number in sorted(waiting, key=lambda k: k != linear.best):
-        minimum = waiting[number].minimum
+    for number, candidate in sorted(enumerate(linear.candidates), key=lambda pair: pair[0] != linear.best):
+        minimum = candidate.minimum
         if number != linear.best and not minimum.converged:
-            ends[number] = waiting.pop(number)
+            ends[number] = candidate.iterate
             continue
         try:
             progress("finite strain: the equilibrium at the linear estimate")
-            objective, coarse = _coarse(waiting.pop(number))
+            objective, coarse = _coarse(candidate.iterate)
             first = [expansion_around(each, tolerance=EQUILIBRIUM, progress=progress) for each in coarse]
             start = [begun(objective.under(first), minimum.unknowns, history=minimum.history)]
-            del coarse, first
+            del coarse, first  # no longer needed where the loop goes on, and large
             end = minimised(start.pop(), bounds, rule, progress=progress, title="finite strain")
             progress("finite strain: the exact equilibrium at the estimate")
             ends[number] = end = end.at_equilibrium()

@@ -60,13 +60,12 @@ def invert(
             " tissues; seek none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
         )
     starts, bounds, ends = settings.every_start, settings.bounds, None if problem.finite_strain else rule
-    start = [informed_start(problem, settings.centre, progress=progress)]
-    # nothing else holds what is followed, so that models that it does without are let go of
-    found = [from_starts(start.pop(), starts, bounds, rule=ends, progress=progress)]
+    start = informed_start(problem, settings.centre, progress=progress)
+    found = from_starts(start, starts, bounds, rule=ends, progress=progress)
     if problem.finite_strain:
         progress = during("finite strain", progress)
-        found = [continue_at_finite_strain(found.pop(), bounds, progress=progress, rule=rule)]
-    return with_released(found.pop(), bounds, progress=progress, rule=rule)
+        found = continue_at_finite_strain(found, bounds, progress=progress, rule=rule)
+    return with_released(found, bounds, progress=progress, rule=rule)
 
 
 @blas_on_one_thread()

@@ -178,6 +178,11 @@ class Objective:
         assert len(found) == len(self.states), "an objective is made of states with approximations"
         return found
 
+    @property
+    def bends_as(self) -> list[Approximation]:
+        """What answers far from where each approximation is exact: what an expansion bends as, else that one."""
+        return [state.bending or model for state, model in zip(self.states, self.approximations, strict=True)]
+
     def linearisation_points(
         self, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, *, all_material: bool = True
     ) -> list[LinearisationPoint]:
@@ -206,7 +211,7 @@ class Objective:
         return replace(self, states=tuple(state.with_approximation(model) for state, model in pairs))
 
     def bent_as(self, models: Sequence[Approximation]) -> Objective:
-        """The same whose answers far from where it ends are those of other reduced models, one a state."""
+        """The same with others in place of what it `bends_as`, one a state."""
         pairs = zip(self.states, models, strict=True)
         states = [replace(s, bending=model) if s.bending else s.with_approximation(model) for s, model in pairs]
         return replace(self, states=tuple(states))

@@ -97,7 +97,7 @@ class StopRule:
         return np.maximum(self.step_sd * posterior_sd(minimum, n_parameters), self.floor)
 
 
-REPORTED = StopRule()
+REPORTED = StopRule()  # of an estimate
 NEAR = StopRule(step_sd=0.2)  # of a start that is followed further, and of an interval: a tenth of its half-width
 
 

@@ -54,8 +54,7 @@ def exact_at_ends(posterior: StatedPosterior, objective: Objective, bounds: Boun
     and which lacks the derivatives that decide there: they are taken from it. The posterior stays as it is without one,
     or where its full model cannot be solved there. objective: that of the posterior, with its models.
     """
-    pairs, least = zip(objective.states, objective.approximations, strict=True), posterior.minimum
-    models = [state.bending or approximation for state, approximation in pairs]
+    models, least = objective.bends_as, posterior.minimum
     if not least.converged or any(np.isfinite(model.trust_radius) for model in models):
         return posterior
     half = NORMAL_95 * np.sqrt(np.diag(posterior.covariance))
