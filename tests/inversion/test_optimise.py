@@ -189,3 +189,5 @@ def test_a_step_that_other_unknowns_make_too_long_does_not_shorten_those_of_the_
     assert refused.damping > 0.0
     assert refused.after(1.0, 1e-4).damping == 0.0
     assert TrustRegion().smaller(0.5).radius == 0.25
+    useless = TrustRegion().smaller(0.5, damps=True)
+    assert (useless.radius, useless.damping) == (refused.radius, refused.damping)

@@ -434,6 +434,26 @@ def test_a_step_that_raises_the_objective_is_refused_and_a_shorter_one_taken(twi
     assert len(refused) == TRIALS
 
 
+@pytest.mark.parametrize(("risen", "taken"), [(4.0, True), (6.0, False)])
+def test_a_step_may_raise_the_objective_by_what_sliding_closest_points_do(
+    twins, twin, voxels, monkeypatch, risen, taken
+):
+    """Once priors are those of J; whatever the scores at both ends of the way say that it gains."""
+    objective, bounds = twins.objective_of(voxels, twin.coefficients), twins.settings(1.0).bounds
+    chosen = replace(objective, chosen=(None,) * len(objective.parameters.blocks))
+    start, evaluated = begun(chosen, np.append([0.0, 0.0], twin.coefficients)), trust_region._evaluated
+
+    def told(step, *of):
+        there, spent = evaluated(step, *of)
+        seen = there.minimum.evaluation
+        value = seen.value + step.now + risen - step.total(seen)
+        return replace(there, minimum=replace(there.minimum, evaluation=replace(seen, value=value))), spent
+
+    monkeypatch.setattr(trust_region, "_evaluated", told)
+    end = minimised(start, bounds, replace(CHEAP, iterations=1, learn=False), progress=twins.silent, title="")
+    assert (end.minimum.outcome is not Outcome.STUCK) is taken
+
+
 def unfollowed(basis, times):
     """A reduced basis that cannot say what it misses, and that cannot be made exact so many times."""
     failures = list[int]()
@@ -507,11 +527,14 @@ def test_an_estimate_may_move_by_a_share_of_its_own_uncertainty_but_not_without_
 
 
 def test_what_an_approximation_misses_is_told_by_how_far_it_sets_the_moduli_off(twins, twin, voxels):
-    """H^-1 J^T W (r - r_approximate) with the full model's residuals r, from one right-hand side, to a tenth."""
+    """H^-1 J^T W (r - r_approximate) with the full model's residuals r, from one right-hand side, to a tenth.
+
+    And by how much larger the objective is on the full model.
+    """
     crude = reduced_basis(twin.model, np.exp([0.3, -0.2, 0.0]) * twin.moduli)
     start = begun(twins.objective_of(voxels, twin.coefficients).under([crude]), twin.unknowns)
     objective, here = start.objective, start.minimum
-    error, off, _ = trust_region.model_error(objective, here)
+    error, off, rise, _ = trust_region.model_error(objective, here)
     place = LinearisationPoint(objective.parameters.moduli(here.unknowns), here.unknowns[2:])
     full = objective.under([exact_approximation(twin.model, None, place)])(here.unknowns)
     pull = np.zeros(len(here.unknowns))
@@ -522,12 +545,13 @@ def test_what_an_approximation_misses_is_told_by_how_far_it_sets_the_moduli_off(
     assert error > 1e-3
     assert true.max() > 1e-3
     assert off == pytest.approx(true, abs=0.1 * true.max())
+    assert rise == pytest.approx(full.value - here.evaluation.value, rel=0.1)
 
 
 def test_an_approximation_that_cannot_say_what_it_misses_leaves_everything_open(reduced):
     (basis,) = reduced.objective.approximations
-    error, off, _ = trust_region.model_error(reduced.objective.under([unfollowed(basis, 0)]), reduced.minimum)
-    assert error == np.inf
+    error, off, rise, _ = trust_region.model_error(reduced.objective.under([unfollowed(basis, 0)]), reduced.minimum)
+    assert error == rise == np.inf
     assert off.tolist() == [np.inf, np.inf]
 
 

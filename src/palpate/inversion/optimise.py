@@ -113,13 +113,14 @@ class TrustRegion:
     radius: float = 0.5 * RADIUS
     damping: float = 0.0
 
-    def smaller(self, longest: float) -> TrustRegion:
+    def smaller(self, longest: float, *, damps: bool = False) -> TrustRegion:
         """After a step that was refused, whose `longest` log-modulus is known.
 
-        It is damped only where no log-modulus is left to be shortened: damping all unknowns ends a step along a valley.
-        A radius that such steps shortened would stay so: it grows no more where the others are what was too long.
+        It is damped only where shortening log-moduli does not help (`damps`), or none is left to be shortened: damping
+        all unknowns ends a step along a valley. A radius that such steps shortened would stay so: it grows no more
+        where the others are what was too long.
         """
-        if longest > SAME_MINIMUM:
+        if longest > SAME_MINIMUM and not damps:
             return TrustRegion(0.5 * min(self.radius, longest), self.damping)
         return TrustRegion(self.radius, max(4.0 * self.damping, LEAST_DAMPING))
 
