@@ -248,10 +248,10 @@ def _iteration(
 ) -> tuple[OuterIterate, TrustRegion]:
     """One accepted step, or `STUCK` where none of some trials is; the region for the next, and whether it may grow.
 
-    J, with what its model misses, may not rise by more than closest points do where a wall slides; but for a step with
-    the first choice, before which priors are not those of J, and where it `rises` on the way to alternatives that were
-    chosen afresh. One that brings other alternatives may let it rise by what is as good: else linear residuals promised
-    of them what does not hold where they lead, and it is taken again without. So is a first choice that gains too little.
+    J, with what its model misses, may not rise by more than closest points do where a wall slides; but with the first
+    choice, before which priors are not those of J, and where it `rises` on the way to alternatives chosen afresh. With
+    other alternatives it may rise by what is as good: else linear residuals promised of them what does not hold where
+    they lead, and the step is taken again without. So is one with a first choice that gains too little.
     """
     n, before = now.objective.n_parameters, now.minimum
     moduli = np.append(np.arange(n), now.objective.parameters.acting_on_moduli)
