@@ -434,26 +434,6 @@ def test_a_step_that_raises_the_objective_is_refused_and_a_shorter_one_taken(twi
     assert len(refused) == TRIALS
 
 
-@pytest.mark.parametrize(("risen", "taken"), [(4.0, True), (6.0, False)])
-def test_a_step_may_raise_the_objective_by_what_sliding_closest_points_do(
-    twins, twin, voxels, monkeypatch, risen, taken
-):
-    """Once priors are those of J; whatever the scores at both ends of the way say that it gains."""
-    objective, bounds = twins.objective_of(voxels, twin.coefficients), twins.settings(1.0).bounds
-    chosen = replace(objective, chosen=(None,) * len(objective.parameters.blocks))
-    start, evaluated = begun(chosen, np.append([0.0, 0.0], twin.coefficients)), trust_region._evaluated
-
-    def told(step, *of):
-        there, spent = evaluated(step, *of)
-        seen = there.minimum.evaluation
-        value = seen.value + step.now + risen - step.total(seen)
-        return replace(there, minimum=replace(there.minimum, evaluation=replace(seen, value=value))), spent
-
-    monkeypatch.setattr(trust_region, "_evaluated", told)
-    end = minimised(start, bounds, replace(CHEAP, iterations=1, learn=False), progress=twins.silent, title="")
-    assert (end.minimum.outcome is not Outcome.STUCK) is taken
-
-
 def unfollowed(basis, times):
     """A reduced basis that cannot say what it misses, and that cannot be made exact so many times."""
     failures = list[int]()

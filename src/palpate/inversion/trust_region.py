@@ -107,7 +107,7 @@ class OuterIterate:
 
     checks: what it cost to state the approximations' errors; totals: J before and after each accepted step, by one
     linearisation's determinants; correlated: how often a step was so short that the numbers of independent residuals
-    could be taken anew; rise: by how much J is larger on the exact model, as far as the approximations' errors tell.
+    could be taken anew.
     """
 
     objective: Objective
@@ -116,7 +116,6 @@ class OuterIterate:
     checks: SolveCounts = field(default_factory=SolveCounts)
     totals: tuple[tuple[float, float], ...] = ()
     correlated: int = 0
-    rise: float = 0.0
 
     @property
     def counts(self) -> SolveCounts:
@@ -219,7 +218,7 @@ def minimised(
         heading, early = f"{title}, iteration {number}", 2 * number <= rule.iterations
         lowered = f", objective {now.totals[-1][0]:.2f} to {now.totals[-1][1]:.2f}" if now.totals else ""
         progress(f"{heading}: {now.objective.parameters.in_words(now.minimum.unknowns)}{lowered}")
-        now, region = _iteration(now, bounds, rule, region, grows=early, rises=bool(ends))
+        now, region = _iteration(now, bounds, rule, region, grows=early)
         if now.minimum.outcome is Outcome.STUCK:
             break
         if ends and number == last + TRIED and total_counted_as(now, now) >= total_counted_as(ends[-1], now):
@@ -244,14 +243,13 @@ def fit_coefficients(objective: Objective, begin: NDArray[np.float64]) -> Minimu
 
 
 def _iteration(
-    now: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, *, grows: bool, rises: bool
+    now: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, *, grows: bool
 ) -> tuple[OuterIterate, TrustRegion]:
     """One accepted step, or `STUCK` where none of some trials is; the region for the next, and whether it may grow.
 
-    J, with what its model misses, may not rise by more than closest points do where a wall slides; but with the first
-    choice, before which priors are not those of J, and where it `rises` on the way to alternatives chosen afresh. With
-    other alternatives it may rise by what is as good: else linear residuals promised of them what does not hold where
-    they lead, and the step is taken again without. So is one with a first choice that gains too little.
+    A step that brings other alternatives is taken only where J does not rise by more than what is as good: else the
+    linear residuals promised of them what does not hold where they lead, and it is taken again without. So is one with
+    the first choice that gains too little; before that choice priors are not those of J, which may rise by it.
     """
     n, before = now.objective.n_parameters, now.minimum
     moduli = np.append(np.arange(n), now.objective.parameters.acting_on_moduli)
@@ -267,11 +265,10 @@ def _iteration(
             continue
         failure, trial_evaluations = None, trial_evaluations + spent
         seen = there.minimum.evaluation
-        then = step.total(seen) + there.rise
+        then = step.total(seen)
         gain, promised = step.reductions(before.unknowns, seen)
         others, first = _numbers(step.objective) != _numbers(now.objective), not now.objective.chosen
-        most = np.inf if first else AS_GOOD if others else np.inf if rises else 10.0 * NOISE
-        if (gain + NOISE) / (promised + NOISE) > BAD and then - step.now <= most:
+        if (gain + NOISE) / (promised + NOISE) > BAD and (first or not others or then - step.now <= AS_GOOD):
             region = region.after(gain / max(promised, 1e-9), longest, grows=grows)
             end, spent = there.minimum, before.evaluations + trial_evaluations
             end = replace(end, history=(*before.history, Iterate.of(end.unknowns, seen, n)), evaluations=spent)
@@ -386,10 +383,7 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
 
 
 def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule) -> tuple[OuterIterate, int]:
-    """The objective at the end of a step, its model made exact there where its error matters; the evaluations spent.
-
-    Where J would be too large for the step to be taken it stays as it is.
-    """
+    """The objective at the end of a step, its model made exact there where its error matters; the evaluations spent."""
     n, before, unknowns = step.objective.n_parameters, now.minimum, step.minimum.unknowns
     objective = step.objective.rematched(unknowns)
     minimum, spent = replace(step.minimum, evaluation=objective(unknowns), outcome=Outcome.STEPS), 1
@@ -409,22 +403,22 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule) -
         there = OuterIterate(objective, minimum, Convergence(wanted, 0.0, 0.0), now.checks, now.totals)
         return replace(there, correlated=correlated), spent
     left = linearisation_distance(objective, minimum.unknowns) / rule.step_sd if rule.derivatives else 0.0
-    checks, missing, rise = now.checks, np.inf, 0.0
+    checks, missing = now.checks, np.inf
     if left < 1.0:  # else it is made exact in any case
         _, off, rise, cost = model_error(objective, minimum)
         _, promised = step.reductions(before.unknowns, minimum.evaluation)
-        checks, missing = checks + cost, float(np.max(off / (rule.model_error * tolerance), initial=0.0))
-        missing = max(missing, abs(rise) / (NOISE + BAD * max(promised, 0.0)))
+        missing = float(np.max(off / (rule.model_error * tolerance), initial=0.0))
+        checks, missing = checks + cost, max(missing, abs(rise) / (NOISE + BAD * max(promised, 0.0)))
     if max(missing, left) >= 1.0:
         points = objective.linearisation_points(unknowns, minimum.evaluation, all_material=rule.all_material)
         pairs = zip(objective.approximations, points, strict=True)
         objective = objective.under([approximation.update(point) for approximation, point in pairs])
-        minimum, spent, rise = replace(minimum, evaluation=objective(unknowns)), 2, 0.0
+        minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
         steps, across = step.remaining(before.unknowns, minimum.evaluation, bounds)
         if across:  # by a model that is exact there
             wanted, left, missing = size(steps), 0.0, 0.0
-    unmet = Convergence(wanted, left, missing)
-    return OuterIterate(objective, minimum, unmet, checks, now.totals, correlated, rise), spent
+    there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals)
+    return replace(there, correlated=correlated), spent
 
 
 def linearisation_distance(objective: Objective, unknowns: NDArray[np.float64]) -> float:
