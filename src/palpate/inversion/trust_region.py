@@ -73,7 +73,8 @@ class StopRule:
 
     step_sd, floor: a log-modulus may still move by so many of its standard deviations, or by `floor` (of ln E) where
     that is more; coefficients: the decrement a coefficient that may be left; model_error: share of the tolerance by
-    which what the approximation misses may set it off, inf: none is asked for; derivatives: whether those that decide
+    which what the approximation misses may set it off (J by its noise, and a share of what a step promises), inf: none
+    is asked for; derivatives: whether those that decide
     the moduli must be exact so near; all_material: whether those by all material modes are made so with them; learn:
     whether hyper-parameters are sought, too; correlate: whether the numbers of independent residuals are taken anew;
     iterations: the largest number, in the second half of which the trust region grows no more and no alternative is
@@ -405,7 +406,7 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule) -
     left = linearisation_distance(objective, minimum.unknowns) / rule.step_sd if rule.derivatives else 0.0
     checks, missing = now.checks, np.inf
     if left < 1.0:  # else it is made exact in any case
-        _, off, rise, cost = model_error(objective, minimum)
+        off, rise, cost = model_error(objective, minimum)
         _, promised = step.reductions(before.unknowns, minimum.evaluation)
         missing = float(np.max(off / (rule.model_error * tolerance), initial=0.0))
         checks, missing = checks + cost, max(missing, abs(rise) / (NOISE + BAD * max(promised, 0.0)))
@@ -434,19 +435,18 @@ def linearisation_distance(objective: Objective, unknowns: NDArray[np.float64]) 
     return distance
 
 
-def model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray[np.float64], float, SolveCounts]:
-    """What the approximations miss at a minimum: the largest error in energy, and what it cost to know.
+def model_error(objective: Objective, minimum: Minimum) -> tuple[NDArray[np.float64], float, SolveCounts]:
+    """What comes of what the approximations miss at a minimum, by one right-hand side each, and what it cost to know.
 
-    Between them by how much it sets the log-moduli off (n_parameters,): |H^-1 J^T W S du|, with the displacement du
-    that is missing, the residuals' derivatives S by it and the Gauss-Newton matrix H = J^T W J + P; and the objective:
-    r^T W S du + 1/2 du^T S^T W S du. Infinite where an approximation cannot say.
+    By how much it sets the log-moduli off (n_parameters,), |H^-1 J^T W S du|, and by how much larger J is on the exact
+    model, r^T W S du + 1/2 du^T S^T W S du, dimensionless: with the displacement du that is missing, the residuals'
+    derivatives S by it and the Gauss-Newton matrix H = J^T W J + P. Infinite where an approximation cannot say.
     """
     pairs = list(zip(objective.approximations, objective.linearisation_points(minimum.unknowns), strict=True))
     cost = sum((approximation.error_counts for approximation, _ in pairs), SolveCounts())
     errors = [approximation.error(at) for approximation, at in pairs]
-    largest = max(error.relative for error in errors)
-    if not np.isfinite(largest):
-        return np.inf, np.full(objective.n_parameters, np.inf), np.inf, cost
+    if not np.isfinite(max(error.relative for error in errors)):
+        return np.full(objective.n_parameters, np.inf), np.inf, cost
     pull, rise = np.zeros(len(minimum.unknowns)), 0.0
     for term in minimum.evaluation.linearisations:
         du = seen_by(term.observation, errors[term.state].missing)
@@ -454,4 +454,4 @@ def model_error(objective: Objective, minimum: Minimum) -> tuple[float, NDArray[
         pull[term.columns] += term.jacobian.transposed_times(believed * missing)
         rise += float(believed @ (missing * (term.residuals.values + 0.5 * missing)))
     off = np.abs(minimum.evaluation.covariance_columns(objective.n_parameters).T @ pull)
-    return largest, np.asarray(off), rise, cost
+    return np.asarray(off), rise, cost
