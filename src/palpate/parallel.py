@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from multifrontal import blas_on_one_thread, processors
 
-__all__ = ["blas_on_one_thread", "mapped", "processors"]
+__all__ = ["blas_on_one_thread", "both", "mapped", "processors"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -30,3 +30,10 @@ def mapped(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
         return [function(item) for item in items]
     with ThreadPoolExecutor(max_workers=processors()) as pool:
         return list(pool.map(lambda item: item[0].run(function, item[1]), [(copy_context(), item) for item in items]))
+
+
+def both(first: Callable[[], Item], second: Callable[[], Result]) -> tuple[Item, Result]:
+    """Results of two calls that do not hang on each other, as `mapped` has them."""
+    calls: tuple[Callable[[], Any], Callable[[], Any]] = (first, second)
+    one, other = mapped(lambda call: call(), calls)
+    return one, other

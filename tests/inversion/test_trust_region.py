@@ -26,7 +26,6 @@ from palpate.inversion import (
 )
 from palpate.inversion.optimise import RADIUS, TRIALS, TrustRegion, newton_decrement
 from palpate.inversion.trust_region import Convergence, Criterion, total_counted_as
-from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns import layer_blocks
 
@@ -515,7 +514,7 @@ def test_what_an_approximation_misses_is_told_by_how_far_it_sets_the_moduli_off(
     crude = reduced_basis(twin.model, np.exp([0.3, -0.2, 0.0]) * twin.moduli)
     start = begun(twins.objective_of(voxels, twin.coefficients).under([crude]), twin.unknowns)
     objective, here = start.objective, start.minimum
-    off, rise, _ = trust_region.model_error(objective, here)
+    off, rise = trust_region.set_off(objective, here, trust_region.model_errors(objective, here.unknowns))
     place = LinearisationPoint(objective.parameters.moduli(here.unknowns), here.unknowns[2:])
     full = objective.under([exact_approximation(twin.model, None, place)])(here.unknowns)
     pull = np.zeros(len(here.unknowns))
@@ -541,7 +540,7 @@ def test_a_model_is_made_exact_where_it_sets_the_objective_off_by_its_noise_and_
         return reductions(step, *of)
 
     def evaluations(rise):
-        monkeypatch.setattr(trust_region, "model_error", lambda *_: (np.zeros(2), rise, SolveCounts()))
+        monkeypatch.setattr(trust_region, "set_off", lambda *_: (np.zeros(2), rise))
         return minimised(reduced, bounds, rule, progress=twins.silent, title="").minimum.evaluations
 
     monkeypatch.setattr(trust_region._Step, "reductions", told)
@@ -571,7 +570,9 @@ def test_all_unknowns_are_damped_where_shortening_log_moduli_does_not_help(twins
 
 def test_an_approximation_that_cannot_say_what_it_misses_leaves_everything_open(reduced):
     (basis,) = reduced.objective.approximations
-    off, rise, _ = trust_region.model_error(reduced.objective.under([unfollowed(basis, 0)]), reduced.minimum)
+    objective = reduced.objective.under([unfollowed(basis, 0)])
+    errors = trust_region.model_errors(objective, reduced.minimum.unknowns)
+    off, rise = trust_region.set_off(objective, reduced.minimum, errors)
     assert rise == np.inf
     assert off.tolist() == [np.inf, np.inf]
 

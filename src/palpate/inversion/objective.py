@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -264,11 +265,16 @@ class Objective:
 
         Raises `EstimationError` when an observation has nothing left to compare.
         """
-        fresh = []
-        for s in range(len(self.states)):
-            pairs = zip(self._seen(s, self._equilibrium(s, unknowns).values), self._offsets(s, unknowns), strict=True)
-            fresh += [o.rematched(motion, off) if isinstance(o, Rematched) else o for (o, motion), off in pairs]
-        return self.with_observations(fresh)
+
+        def fresh(of: tuple[tuple[Observation, NDArray[np.float64]], float]) -> Observation:
+            """One observation with what belongs together chosen anew."""
+            (observation, motion), offset = of
+            return observation.rematched(motion, offset) if isinstance(observation, Rematched) else observation
+
+        seen = [self._seen(s, self._equilibrium(s, unknowns).values) for s in range(len(self.states))]
+        offsets = [self._offsets(s, unknowns) for s in range(len(self.states))]
+        pairs = zip(itertools.chain.from_iterable(seen), itertools.chain.from_iterable(offsets), strict=True)
+        return self.with_observations(mapped(fresh, pairs))
 
     def _equilibrium(self, s: int, unknowns: NDArray[np.float64]) -> Equilibrium:
         observed = self.states[s].observed

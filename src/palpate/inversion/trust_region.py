@@ -12,7 +12,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.approximation.contract import Approximation
+from palpate.approximation.contract import Approximation, ModelError
 from palpate.approximation.expansion import Expansion
 from palpate.errors import NotConverged
 from palpate.inversion.hyper_parameters import with_correlations, with_hyper_parameters
@@ -32,6 +32,7 @@ from palpate.inversion.optimise import (
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.contract import seen_by
+from palpate.parallel import both
 from palpate.progress import silent
 
 NOISE = 0.5  # of the objective: that of closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
@@ -387,7 +388,12 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule) -
     """The objective at the end of a step, its model made exact there where its error matters; the evaluations spent."""
     n, before, unknowns = step.objective.n_parameters, now.minimum, step.minimum.unknowns
     objective = step.objective.rematched(unknowns)
-    minimum, spent = replace(step.minimum, evaluation=objective(unknowns), outcome=Outcome.STEPS), 1
+    asked, left = bool(np.isfinite(rule.model_error)), 0.0
+    if asked and rule.derivatives:
+        left = linearisation_distance(objective, unknowns) / rule.step_sd
+        asked = left < 1.0  # else it is made exact in any case
+    evaluation, errors = both(lambda: objective(unknowns), lambda: model_errors(objective, unknowns) if asked else [])
+    minimum, spent = replace(step.minimum, evaluation=evaluation, outcome=Outcome.STEPS), 1
     tolerance = rule.tolerance(minimum, n)
 
     def size(steps: Sequence[NDArray[np.float64]]) -> float:
@@ -403,13 +409,13 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule) -
     if np.isinf(rule.model_error):
         there = OuterIterate(objective, minimum, Convergence(wanted, 0.0, 0.0), now.checks, now.totals)
         return replace(there, correlated=correlated), spent
-    left = linearisation_distance(objective, minimum.unknowns) / rule.step_sd if rule.derivatives else 0.0
     checks, missing = now.checks, np.inf
-    if left < 1.0:  # else it is made exact in any case
-        off, rise, cost = model_error(objective, minimum)
+    if asked:
+        off, rise = set_off(objective, minimum, errors)
         _, promised = step.reductions(before.unknowns, minimum.evaluation)
         missing = float(np.max(off / (rule.model_error * tolerance), initial=0.0))
-        checks, missing = checks + cost, max(missing, abs(rise) / (NOISE + BAD * max(promised, 0.0)))
+        missing = max(missing, abs(rise) / (NOISE + BAD * max(promised, 0.0)))
+        checks = sum((approximation.error_counts for approximation in objective.approximations), checks)
     if max(missing, left) >= 1.0:
         points = objective.linearisation_points(unknowns, minimum.evaluation, all_material=rule.all_material)
         pairs = zip(objective.approximations, points, strict=True)
@@ -435,18 +441,21 @@ def linearisation_distance(objective: Objective, unknowns: NDArray[np.float64]) 
     return distance
 
 
-def model_error(objective: Objective, minimum: Minimum) -> tuple[NDArray[np.float64], float, SolveCounts]:
-    """What comes of what the approximations miss at a minimum, by one right-hand side each, and what it cost to know.
+def model_errors(objective: Objective, unknowns: NDArray[np.float64]) -> list[ModelError]:
+    """What the approximation of each state misses at unknowns (n_unknowns,), by one right-hand side each."""
+    pairs = zip(objective.approximations, objective.linearisation_points(unknowns), strict=True)
+    return [approximation.error(at) for approximation, at in pairs]
+
+
+def set_off(objective: Objective, minimum: Minimum, errors: Sequence[ModelError]) -> tuple[NDArray[np.float64], float]:
+    """What comes of what the approximations miss at a minimum, by the `errors` of each state's.
 
     By how much it sets the log-moduli off (n_parameters,), |H^-1 J^T W S du|, and by how much larger J is on the exact
     model, r^T W S du + 1/2 du^T S^T W S du, dimensionless: with the displacement du that is missing, the residuals'
     derivatives S by it and the Gauss-Newton matrix H = J^T W J + P. Infinite where an approximation cannot say.
     """
-    pairs = list(zip(objective.approximations, objective.linearisation_points(minimum.unknowns), strict=True))
-    cost = sum((approximation.error_counts for approximation, _ in pairs), SolveCounts())
-    errors = [approximation.error(at) for approximation, at in pairs]
     if not np.isfinite(max(error.relative for error in errors)):
-        return np.full(objective.n_parameters, np.inf), np.inf, cost
+        return np.full(objective.n_parameters, np.inf), np.inf
     pull, rise = np.zeros(len(minimum.unknowns)), 0.0
     for term in minimum.evaluation.linearisations:
         du = seen_by(term.observation, errors[term.state].missing)
@@ -454,4 +463,4 @@ def model_error(objective: Objective, minimum: Minimum) -> tuple[NDArray[np.floa
         pull[term.columns] += term.jacobian.transposed_times(believed * missing)
         rise += float(believed @ (missing * (term.residuals.values + 0.5 * missing)))
     off = np.abs(minimum.evaluation.covariance_columns(objective.n_parameters).T @ pull)
-    return np.asarray(off), rise, cost
+    return np.asarray(off), rise

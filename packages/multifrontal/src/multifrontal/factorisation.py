@@ -31,7 +31,7 @@ class Factor:
         """A^-1 rhs for one right-hand side (n,) or several (n, m), to the rounding of the factor's precision."""
         with blas_on_one_thread():
             found = substituted(self.plan, self.numbers, rhs[:, None] if rhs.ndim == 1 else rhs)
-        return np.asarray(found.reshape(rhs.shape), dtype=np.float64)
+        return found.reshape(rhs.shape)
 
 
 class _Plans:

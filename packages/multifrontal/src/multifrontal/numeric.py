@@ -24,6 +24,7 @@ BLOCK = 256  # columns of a large front that are eliminated before the others he
 Everywhere = Callable[[Callable[[Any], None], Iterable[Any]], None]
 FEW = 6  # right-hand sides up to which one at a time is fastest: the products of several have no kernel for so few
 CACHE = 1 << 19  # bytes of a front that are met by all of these while they lie in the cache
+ROWS = 2048  # of right-hand sides that are put in order while they lie in the cache
 LARGEST_BLOCK = 64  # right-hand sides of a thread; more at once are not faster and take more memory
 
 
@@ -182,13 +183,15 @@ def _check(work: _Work, front: Front, pivot: int, before: int = 0) -> None:
         raise NotPositiveDefinite(len(work.plan.order), front.first + before + pivot)
 
 
-def substituted(plan: Plan, factor: Matrix, rhs: NDArray[np.float64]) -> NDArray[Any]:
-    """X (n, m) of L L^T X = rhs (n, m), in the type of the factor."""
-    m, threads = rhs.shape[1], plan.threads
-    result = np.empty(rhs.shape, factor.dtype)
+def substituted(plan: Plan, factor: Matrix, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """X (n, m) of L L^T X = rhs (n, m), computed in the type of the factor."""
+    n, m, threads = *rhs.shape, plan.threads
+    result = np.empty(rhs.shape)
     ends = np.linspace(0, m, max(-(-m // (LARGEST_BLOCK * threads)), 1) + 1).astype(int).tolist()
     for begin, end in pairwise(ends):
-        x = np.ascontiguousarray(rhs[plan.order, begin:end], dtype=factor.dtype)
+        x = np.empty((n, end - begin), factor.dtype)
+        for some in (slice(start, start + ROWS) for start in range(0, n, ROWS)):
+            x[some] = rhs[plan.order[some], begin:end]
         if end - begin <= FEW:
             x = _one_by_one(plan, factor, x)
         elif threads == 1:

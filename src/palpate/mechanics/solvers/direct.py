@@ -56,7 +56,9 @@ class MixedFactorisation:
     def nearly(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         """A^-1 rhs (n, m) to single precision."""
         sizes = np.maximum(np.abs(rhs).max(axis=0, initial=0.0), np.finfo(np.float64).tiny)  # single has a small range
-        return np.asarray(self.factor.solve(rhs / sizes) * (sizes / self.scale))
+        solution = self.factor.solve(rhs / sizes)
+        solution *= sizes / self.scale
+        return solution
 
     def solve(self, rhs: NDArray[np.float64], *, tolerance: float = EXACT) -> NDArray[np.float64]:
         """Solution X (n, m) of A X = rhs (n, m) to a relative residual of `tolerance`; raises `SolverError`."""
