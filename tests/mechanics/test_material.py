@@ -125,6 +125,14 @@ def test_the_adjoint_of_a_patchy_body_is_its_transposed_tangent(there, tangent, 
     assert there.adjoint(gradient) == pytest.approx(tangent.T @ gradient, rel=1e-6, abs=1e-6)
 
 
+def test_forces_by_given_coefficients_are_the_sum_of_those_by_each(body, modes, coefficients, rng):
+    model, values = linear_model(*body, material=modes), rng.normal(size=3 * len(body[0].points))
+    every = model.by_material(MODULI, values).along(coefficients[1][:, None])[:, 0]
+    found = model.heterogeneous_forces(MODULI, values, coefficients[1])
+    assert found == pytest.approx(every, abs=1e-12 * np.abs(every).max())
+    assert np.abs(every).max() > 1.0
+
+
 class Counted:
     """A factorisation that counts the right-hand sides it solves."""
 

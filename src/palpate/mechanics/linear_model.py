@@ -20,7 +20,13 @@ from palpate.mechanics.forward import DenseEquilibrium, SolveCounts, checked_coe
 from palpate.mechanics.hyperelastic import Elements, Moduli, elements_of
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.loads import Load
-from palpate.mechanics.material import HOMOGENEOUS, MaterialForces, MaterialModes, material_forces
+from palpate.mechanics.material import (
+    HOMOGENEOUS,
+    MaterialForces,
+    MaterialModes,
+    heterogeneous_forces,
+    material_forces,
+)
 from palpate.mechanics.rigid import linear_displacements, rigid_modes
 from palpate.mechanics.solvers.conjugate_gradients import times
 from palpate.mechanics.solvers.contract import AT_ONCE, EXACT, Factorisation
@@ -177,20 +183,28 @@ class LinearModel:
         """Derivatives of the nodal forces at u (n_dof,) mm and moduli (n_regions,) kPa by the material coefficients."""
         if self.elements is None:
             return MaterialForces(len(values), ())
-        tissue, dilatation = self.space.mesh.region, self.elements.dilatation
+        tissue, (lame, slopes) = self.space.mesh.region, self._lame(moduli, self.elements.dilatation)
+        return material_forces(self.elements, self.material, values, lame, by_poisson=slopes, tissue=tissue)
+
+    def heterogeneous_forces(
+        self, moduli: NDArray[np.float64], values: NDArray[np.float64], coefficients: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """The same derivatives G at u (n_dof,) mm times coefficients c (n_material,): G c (n_dof,), mN."""
+        if self.elements is None:
+            return np.zeros_like(values)
+        tissue, (lame, slopes) = self.space.mesh.region, self._lame(moduli, self.elements.dilatation)
+        of = (self.elements, self.material, values, lame, coefficients)
+        return heterogeneous_forces(*of, by_poisson=slopes, tissue=tissue)
+
+    def _lame(self, moduli: NDArray[np.float64], dilatation: Dilatation) -> tuple[Moduli, Moduli]:
+        """Lame's constants (n_tets,) of all elements at moduli (n_regions,) kPa; their slopes by Poisson's ratio."""
+        tissue = self.space.mesh.region
         lame, slopes = (np.zeros((3, len(tissue))) for _ in range(2))
         for modulus, region, weight in zip(moduli, self.regions, self.weights, strict=True):
             own, ratio = tissue == region, self.space.mesh.tissues[region].poisson_ratio
             lame[:, own] += modulus * np.array(weight)[:, None]
             slopes[:, own] = modulus * np.array(lame_parts_by_poisson(ratio, dilatation))[:, None]
-        return material_forces(
-            self.elements,
-            self.material,
-            values,
-            Moduli(*lame),
-            by_poisson=Moduli(*slopes),
-            tissue=tissue,
-        )
+        return Moduli(*lame), Moduli(*slopes)
 
 
 @dataclass(frozen=True, slots=True)

@@ -141,11 +141,44 @@ def material_forces(
 
     def scatter(forces: NDArray[np.float64]) -> sparse.csc_matrix[np.float64]:
         """Element forces (n_cells, n_a, 3) at the unknowns they act on (n_dof, n_cells)."""
-        rows = (3 * elements.cells[:, :, None] + np.arange(3)).reshape(len(elements.cells), -1)
+        rows = _unknowns_of(elements)
         ends = rows.shape[1] * np.arange(len(rows) + 1)
         return sparse.csc_matrix((forces.ravel(), rows.ravel(), ends), shape=(n_dof, len(rows)))
 
-    own = np.array([np.isin(tissue, group) for group in modes.poisson], dtype=np.float64).reshape(-1, len(tissue))
-    every = ((modes.fields, moduli), (sparse.csr_matrix(own.T), by_poisson))
+    every = ((modes.fields, moduli), (_of_poisson(modes, tissue), by_poisson))
     found = [(scatter(elements.forces(nodal, of)), amounts) for amounts, of in every if amounts.shape[1]]
     return MaterialForces(n_dof, tuple(found))
+
+
+def heterogeneous_forces(
+    elements: Elements,
+    modes: MaterialModes,
+    displacement: NDArray[np.float64],
+    moduli: Moduli,
+    coefficients: NDArray[np.float64],
+    *,
+    by_poisson: Moduli,
+    tissue: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """G c (n_dof,), mN, with the derivatives G of `material_forces` at u (n_dof,) mm and given c (n_modes,).
+
+    They are the forces of elements with Lame's constants as c changes them: one sum over the elements.
+    """
+    n_fields = modes.fields.shape[1]
+    amount = np.asarray(modes.fields @ coefficients[:n_fields])
+    shift = np.asarray(_of_poisson(modes, tissue) @ coefficients[n_fields:])
+    pairs = ((moduli.mu, by_poisson.mu), (moduli.pointwise, by_poisson.pointwise), (moduli.mean, by_poisson.mean))
+    changed = Moduli(*(amount * own + shift * slope for own, slope in pairs))
+    forces, rows = elements.forces(displacement.reshape(-1, 3), changed), _unknowns_of(elements)
+    return np.asarray(np.bincount(rows.ravel(), weights=forces.ravel(), minlength=len(displacement)), dtype=np.float64)
+
+
+def _unknowns_of(elements: Elements) -> NDArray[np.int64]:
+    """Numbers (n_cells, 3 n_a) of the unknowns that each element's forces act on."""
+    return np.asarray((3 * elements.cells[:, :, None] + np.arange(3)).reshape(len(elements.cells), -1))
+
+
+def _of_poisson(modes: MaterialModes, tissue: NDArray[np.int64]) -> sparse.csr_matrix[np.float64]:
+    """Which elements (n_tets, n_groups) each coefficient of a Poisson's ratio acts on."""
+    own = np.array([np.isin(tissue, group) for group in modes.poisson], dtype=np.float64).reshape(-1, len(tissue))
+    return sparse.csr_matrix(own.T)
