@@ -28,9 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.approximation import ReducedBasis
-from palpate.inversion import Inversion, Objective, invert
-from palpate.inversion.optimise import Minimum
-from palpate.observation.contract import seen_by
+from palpate.inversion import Inversion, Linearisation, Minimum, Objective, invert
 from palpate.study import inverse_problem, inversion_settings, make_body, read_case, read_states
 
 STEP = 0.2
@@ -107,8 +105,8 @@ class _Estimate:
             return np.asarray(system.material_responses(homogeneous, q[boundary:, None])[:, 0])
 
         change, pull = (following(STEP) - following(-STEP)) / (2.0 * STEP), 0.0
-        for term in self.minimum.evaluation.linearisations:
-            moved = np.asarray(term.residuals.jacobian @ seen_by(term.observation, change))
+        for term, seen in self._seen(change):
+            moved = np.asarray(term.residuals.jacobian @ seen)
             pull += float(moved @ (term.precision * term.weights * term.residuals.values))
         return pull
 
@@ -127,10 +125,16 @@ class _Estimate:
         system, tangent = self.basis.full_model.system(moduli), self.basis.model.solve(moduli, homogeneous).tangent()
         tangent[:, first:] = system.material_responses(system.solve(homogeneous).values)
         matrix = evaluation.prior.copy()
-        for term in evaluation.linearisations:
-            jacobian = term.jacobian.under(parameters.by_unknowns(seen_by(term.observation, tangent), unknowns))
+        for term, seen in self._seen(tangent):
+            jacobian = term.jacobian.under(parameters.by_unknowns(seen, unknowns))
             matrix[np.ix_(term.columns, term.columns)] += jacobian.gram(term.precision * term.weights)
         return float(np.linalg.slogdet(matrix[n:, n:])[1])
+
+    def _seen(self, displacements: NDArray[np.float64]) -> list[tuple[Linearisation, NDArray[np.float64]]]:
+        """Each linearisation with what it sees of displacements (n_dof,) or (n_dof, k) mm."""
+        (state,) = self.objective.states
+        seen, rows = state.seen(displacements), state.slices
+        return [(term, seen[own]) for term, own in zip(self.minimum.evaluation.linearisations, rows, strict=True)]
 
 
 if __name__ == "__main__":
