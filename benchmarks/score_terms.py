@@ -86,7 +86,9 @@ class _Estimate:
         """The best minimum of an inversion; raises `SystemExit` for one of several states."""
         (*others, basis) = inversion.objective.approximations
         if others or not isinstance(basis, ReducedBasis):
-            raise SystemExit("score_terms.py measures one later image under the linear law")
+            raise SystemExit(
+                f"score_terms.py measures one later image, and this case has {len(others) + 1}: name one in [images]"
+            )
         return cls(inversion.objective, inversion.minimum, basis)
 
     def pull_lacking(self, direction: NDArray[np.float64]) -> float:

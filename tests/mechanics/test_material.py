@@ -125,11 +125,12 @@ def test_the_adjoint_of_a_patchy_body_is_its_transposed_tangent(there, tangent, 
     assert there.adjoint(gradient) == pytest.approx(tangent.T @ gradient, rel=1e-6, abs=1e-6)
 
 
-def test_forces_by_given_coefficients_are_the_sum_of_those_by_each(body, modes, coefficients, rng):
+def test_forces_along_a_single_direction_of_the_material_are_those_among_several(body, modes, coefficients, rng):
     model, values = linear_model(*body, material=modes), rng.normal(size=3 * len(body[0].points))
-    every = model.by_material(MODULI, values).along(coefficients[1][:, None])[:, 0]
-    found = model.heterogeneous_forces(MODULI, values, coefficients[1])
-    assert found == pytest.approx(every, abs=1e-12 * np.abs(every).max())
+    directions = np.column_stack([coefficients[1], rng.normal(size=modes.n_modes)])
+    every = model.material_forces(MODULI, values, directions)
+    single = [model.material_forces(MODULI, values, d[:, None])[:, 0] for d in directions.T]
+    assert np.column_stack(single) == pytest.approx(every, abs=1e-12 * np.abs(every).max())
     assert np.abs(every).max() > 1.0
 
 

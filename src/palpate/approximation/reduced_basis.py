@@ -125,11 +125,11 @@ class ReducedBasis:
         Of its parts, too, that follow the material modes.
         """
         model, displacement = self.full_model, self._homogeneous(at)
-        material = at.coefficients[model.constraint.n_modes :]
+        material = at.coefficients[model.constraint.n_modes :, None]
         if not np.any(material):
             return ModelError(*self.system.error_bound(at.moduli, displacement))
-        forces = model.heterogeneous_forces(at.moduli, displacement, material)[:, None]
-        whole = displacement + self.model.output_material @ material
+        forces = model.material_forces(at.moduli, displacement, material)
+        whole = displacement + (self.model.output_material @ material)[:, 0]
         return ModelError(*self.system.error_bound(at.moduli, whole, np.asarray(model.constraint.free.T @ forces)))
 
     def with_material(self, responses: NDArray[np.float64], moduli: NDArray[np.float64]) -> ReducedBasis:

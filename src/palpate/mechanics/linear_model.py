@@ -24,7 +24,7 @@ from palpate.mechanics.material import (
     HOMOGENEOUS,
     MaterialForces,
     MaterialModes,
-    heterogeneous_forces,
+    material_force_along,
     material_forces,
 )
 from palpate.mechanics.rigid import linear_displacements, rigid_modes
@@ -175,9 +175,13 @@ class LinearModel:
     ) -> NDArray[np.float64]:
         """Derivatives (n_dof, k), mN, of the nodal forces at u (n_dof,) mm along directions (n_material, k).
 
-        Of the material coefficients; moduli (n_regions,) kPa.
+        Of the material coefficients; moduli (n_regions,) kPa. Along a single one they are one sum over the elements.
         """
-        return self.by_material(moduli, values).along(directions)
+        if self.elements is None or directions.shape[1] != 1:
+            return self.by_material(moduli, values).along(directions)
+        tissue, (lame, slopes) = self.space.mesh.region, self._lame(moduli, self.elements.dilatation)
+        of = (self.elements, self.material, values, lame, directions[:, 0])
+        return material_force_along(*of, by_poisson=slopes, tissue=tissue)[:, None]
 
     def by_material(self, moduli: NDArray[np.float64], values: NDArray[np.float64]) -> MaterialForces:
         """Derivatives of the nodal forces at u (n_dof,) mm and moduli (n_regions,) kPa by the material coefficients."""
@@ -185,16 +189,6 @@ class LinearModel:
             return MaterialForces(len(values), ())
         tissue, (lame, slopes) = self.space.mesh.region, self._lame(moduli, self.elements.dilatation)
         return material_forces(self.elements, self.material, values, lame, by_poisson=slopes, tissue=tissue)
-
-    def heterogeneous_forces(
-        self, moduli: NDArray[np.float64], values: NDArray[np.float64], coefficients: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """The same derivatives G at u (n_dof,) mm times coefficients c (n_material,): G c (n_dof,), mN."""
-        if self.elements is None:
-            return np.zeros_like(values)
-        tissue, (lame, slopes) = self.space.mesh.region, self._lame(moduli, self.elements.dilatation)
-        of = (self.elements, self.material, values, lame, coefficients)
-        return heterogeneous_forces(*of, by_poisson=slopes, tissue=tissue)
 
     def _lame(self, moduli: NDArray[np.float64], dilatation: Dilatation) -> tuple[Moduli, Moduli]:
         """Lame's constants (n_tets,) of all elements at moduli (n_regions,) kPa; their slopes by Poisson's ratio."""

@@ -150,23 +150,24 @@ def material_forces(
     return MaterialForces(n_dof, tuple(found))
 
 
-def heterogeneous_forces(
+def material_force_along(
     elements: Elements,
     modes: MaterialModes,
     displacement: NDArray[np.float64],
     moduli: Moduli,
-    coefficients: NDArray[np.float64],
+    direction: NDArray[np.float64],
     *,
     by_poisson: Moduli,
     tissue: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """G c (n_dof,), mN, with the derivatives G of `material_forces` at u (n_dof,) mm and given c (n_modes,).
+    """G d (n_dof,), mN, of the derivatives G of `material_forces` and one direction d (n_modes,).
 
-    They are the forces of elements with Lame's constants as c changes them: one sum over the elements.
+    The internal forces at u (n_dof,) mm of Lame's constants that change as d says, for they are linear in these: one
+    sum over the elements. moduli, by_poisson, tissue: as there.
     """
     n_fields = modes.fields.shape[1]
-    amount = np.asarray(modes.fields @ coefficients[:n_fields])
-    shift = np.asarray(_of_poisson(modes, tissue) @ coefficients[n_fields:])
+    amount = np.asarray(modes.fields @ direction[:n_fields])
+    shift = np.asarray(_of_poisson(modes, tissue) @ direction[n_fields:])
     pairs = ((moduli.mu, by_poisson.mu), (moduli.pointwise, by_poisson.pointwise), (moduli.mean, by_poisson.mean))
     changed = Moduli(*(amount * own + shift * slope for own, slope in pairs))
     forces, rows = elements.forces(displacement.reshape(-1, 3), changed), _unknowns_of(elements)
