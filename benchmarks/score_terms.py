@@ -2,15 +2,18 @@
 
     python benchmarks/score_terms.py CASE.toml [CASE.toml ...] [--set KEY=VALUE ...] [--json]
 
-Of cases of one later image, under the linear law. The steps of each log-modulus that either would add to the estimate,
+Of cases of one later image, under the linear law. The steps of each log-modulus that each would add to the estimate,
 in its posterior standard deviations sd:
 
 - responses: the displacement is u(E, q) + U(E, q) c with responses U to the material modes c, and the reduced model
   holds U while E and q move. With the change dx of U c along h = H^-1 e_i and the residuals' derivatives S by the
   displacement the step is -dx^T S^T W r, which the score lacks.
 - determinant: the mode of the moduli alone, the other unknowns n integrated over by Laplace's approximation, lies
-  -(H^-1)_tt d(1/2 ln det H_nn)/dt from the mode of all unknowns together. The boundary modes' responses are those of
-  the reduced model, those of the material modes the full model's.
+  -(H^-1)_tt d(1/2 ln det H_nn)/dt from the mode of all unknowns together. Its two parts are the changes of the
+  responses to the boundary modes, those of the reduced model, and to the material modes, those of the full model.
+
+Where a truth.json with "moduli_kpa" lies beside a case, as in the scenes of mismatch.py, the errors of ln E are told as
+they are and with these steps: with both terms (the whole likelihood), and with those of the material modes alone.
 
 Derivatives are central differences over 0.2 of sd and of ln E.
 """
@@ -19,7 +22,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +37,7 @@ from palpate.inversion import Inversion, Linearisation, Minimum, Objective, inve
 from palpate.study import inverse_problem, inversion_settings, make_body, read_case, read_states
 
 STEP = 0.2
+TERMS = ("responses", "determinant_boundary", "determinant_material")
 
 
 def main() -> int:
@@ -43,14 +49,18 @@ def main() -> int:
     arguments = parser.parse_args()
     found = []
     for path in arguments.cases:
-        found.append({"case": path.parent.name, **measured(estimated(path, arguments.set))})
+        inversion, truth = estimated(path, arguments.set), path.parent / "truth.json"
+        true = json.loads(truth.read_text())["moduli_kpa"] if truth.exists() else {}
+        found.append({"case": path.parent.name, **measured(inversion), "ln_errors": errors(inversion, true)})
         if not arguments.json:
-            words = [
-                f"{name} {', '.join(f'{x:.2f}' for x in found[-1][name])}" for name in ("responses", "determinant")
-            ]
+            words = [f"{term} {', '.join(f'{x:.2f}' for x in found[-1][term])}" for term in TERMS]
             print(f"{found[-1]['case']}: in sd, by {'; by '.join(words)}", flush=True)
+    rows = summary(found)
     if arguments.json:
-        print(json.dumps(found, indent=1))
+        print(json.dumps({"cases": found, "summary": rows}, indent=1))
+    else:
+        for name, row in rows.items():
+            print(f"{name}: {row['number']} errors of ln E, RMS {row['rms']:.3f}, mean {row['mean']:.3f}")
     return 0
 
 
@@ -67,10 +77,39 @@ def measured(inversion: Inversion) -> dict[str, Any]:
     of, n = _Estimate.of(inversion), inversion.objective.n_parameters
     covariance = of.minimum.evaluation.covariance_columns(n)
     sd = np.sqrt(np.diag(covariance[:n]))
-    lacking = [of.pull_lacking(covariance[:, i] / sd[i]) for i in range(n)]
-    slopes = [of.determinant_slope(i) for i in range(n)]
-    by_determinant = -covariance[:n] @ slopes / sd
-    return {"responses": (-np.array(lacking)).tolist(), "determinant": by_determinant.tolist(), "sd": sd.tolist()}
+    lacking = -np.array([of.pull_lacking(covariance[:, i] / sd[i]) for i in range(n)])
+    slopes = np.array([of.determinant_slopes(i) for i in range(n)])
+    steps = [lacking, *(-covariance[:n] @ slopes / sd[:, None]).T]
+    return {**{term: step.tolist() for term, step in zip(TERMS, steps, strict=True)}, "sd": sd.tolist()}
+
+
+def errors(inversion: Inversion, truth: dict[str, float]) -> list[float | None]:
+    """Ln of each estimated modulus over its truth, kPa, None without one."""
+    parameters = inversion.objective.parameters
+    known = dict(
+        zip(inversion.objective.states[0].model.names, parameters.moduli(inversion.minimum.unknowns), strict=True)
+    )
+    return [math.log(known[name] / truth[name]) if name in truth else None for name in parameters.names]
+
+
+def summary(found: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Number, RMS and mean of the errors of ln E, as they are and with the steps of some terms; none without truths."""
+    named = {"as estimated": (), "with the material modes' terms": (TERMS[0], TERMS[2]), "with all terms": TERMS}
+    rows = {}
+    for name, terms in named.items():
+        moved = [
+            error + sd * sum(step)
+            for case in found
+            for error, sd, *step in zip(case["ln_errors"], case["sd"], *(case[term] for term in terms), strict=True)
+            if error is not None
+        ]
+        if moved:
+            rows[name] = {
+                "number": len(moved),
+                "rms": float(np.sqrt(np.mean(np.square(moved)))),
+                "mean": float(np.mean(moved)),
+            }
+    return rows
 
 
 @dataclass(frozen=True)
@@ -112,23 +151,36 @@ class _Estimate:
             pull += float(moved @ (term.precision * term.weights * term.residuals.values))
         return pull
 
-    def determinant_slope(self, i: int) -> float:
-        """Derivative of 1/2 ln det H_nn by the i-th log-modulus."""
+    def determinant_slopes(self, i: int) -> tuple[float, float]:
+        """Derivatives of 1/2 ln det H_nn by the i-th log-modulus, by responses to boundary and to material modes."""
         step = np.where(np.arange(len(self.minimum.unknowns)) == i, STEP, 0.0)
-        ends = [self._log_determinant(self.minimum.unknowns + sign * step) for sign in (1.0, -1.0)]
-        return 0.5 * (ends[0] - ends[1]) / (2.0 * STEP)
+        ends = [self.minimum.unknowns + sign * step for sign in (1.0, -1.0)]
+        here, there = self._tangent(self.minimum.unknowns), [self._tangent(end) for end in ends]
+        first, found = len(self.objective.parameters.base) + self.basis.constraint.n_modes, []
+        for changes in (slice(0, first), slice(first, None)):
+            values = []
+            for end, moved in zip(ends, there, strict=True):
+                tangent = here.copy()
+                tangent[:, changes] = moved[:, changes]
+                values.append(self._log_determinant(end, tangent))
+            found.append(0.5 * (values[0] - values[1]) / (2.0 * STEP))
+        return found[0], found[1]
 
-    def _log_determinant(self, unknowns: NDArray[np.float64]) -> float:
-        """Ln det of the unknowns' part of H beside the moduli, by the responses at unknowns (n_unknowns,)."""
-        parameters, evaluation, n = self.objective.parameters, self.minimum.evaluation, self.objective.n_parameters
+    def _tangent(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives (n_dof, n_regions + n_modes) mm by ln E and coefficients at unknowns (n_unknowns,)."""
+        parameters, boundary = self.objective.parameters, self.basis.constraint.n_modes
         moduli, q = parameters.moduli(unknowns), parameters.coefficients(unknowns)[0]
-        first = len(parameters.base) + self.basis.constraint.n_modes
-        homogeneous = np.where(np.arange(len(q)) < self.basis.constraint.n_modes, q, 0.0)
+        homogeneous = np.where(np.arange(len(q)) < boundary, q, 0.0)
         system, tangent = self.basis.full_model.system(moduli), self.basis.model.solve(moduli, homogeneous).tangent()
-        tangent[:, first:] = system.material_responses(system.solve(homogeneous).values)
+        tangent[:, len(parameters.base) + boundary :] = system.material_responses(system.solve(homogeneous).values)
+        return tangent
+
+    def _log_determinant(self, unknowns: NDArray[np.float64], tangent: NDArray[np.float64]) -> float:
+        """Ln det of H's part of the unknowns beside the moduli, of a tangent (n_dof, n_regions + n_modes) mm."""
+        evaluation, n = self.minimum.evaluation, self.objective.n_parameters
         matrix = evaluation.prior.copy()
         for term, seen in self._seen(tangent):
-            jacobian = term.jacobian.under(parameters.by_unknowns(seen, unknowns))
+            jacobian = term.jacobian.under(self.objective.parameters.by_unknowns(seen, unknowns))
             matrix[np.ix_(term.columns, term.columns)] += jacobian.gram(term.precision * term.weights)
         return float(np.linalg.slogdet(matrix[n:, n:])[1])
 

@@ -7,12 +7,13 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from palpate.approximation.contract import LinearisationPoint, ModelError, determined
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.mechanics.reduced import Projection, ReducedModel, projection
-from palpate.mechanics.solvers.conjugate_gradients import Product, conjugate_gradients
+from palpate.mechanics.solvers.conjugate_gradients import Product, conjugate_gradients, times
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import SOLVERS, CheckedFactorisation
 from palpate.mesh.space import Constraint
@@ -252,7 +253,7 @@ def reduced_basis(model: LinearModel, moduli: NDArray[np.float64]) -> ReducedBas
 
 def basis_of(system: LinearSystem, responses: NDArray[np.float64], counts: SolveCounts) -> ReducedBasis:
     """A system's model on displacements (n_dof, k) mm that are there, with what they, and the system, cost."""
-    snapshots = np.asarray(system.model.constraint.free.T @ responses)
+    snapshots = times(sparse.csr_matrix(system.model.constraint.free.T), responses)
     return ReducedBasis(projection(system.model, snapshots), system, counts)
 
 

@@ -109,7 +109,8 @@ class _Responses:
         self, model: LinearModel, boundary: NDArray[np.float64], material: NDArray[np.float64]
     ) -> ReducedBasis:
         """The reduced basis of combinations (n_boundary, k) and (n_material, l), of which `model` is made."""
-        every = linalg.block_diag(boundary, np.eye(1)).astype(np.float32)
+        own = np.eye(1, int(np.any(self.boundary[:, -1])))  # that of offset and loads, where there are any
+        every = linalg.block_diag(boundary, own).astype(np.float32)
         parts = mapped(lambda rows: (rows @ every).astype(np.float64), np.array_split(self.boundary, processors()))
         cost = self.system.response_counts + SolveCounts(tangent=self.material.shape[1])
         basis = basis_of(replace(self.system, model=model), np.concatenate(parts), cost)

@@ -151,9 +151,12 @@ class LinearModel:
 
     def free_forces(self, moduli: NDArray[np.float64], free: NDArray[np.float64]) -> NDArray[np.float64]:
         """Forces F^T K(E) F z (n_free, k), mN, of free displacements z (n_free, k) mm at moduli (n_regions,) kPa."""
-        total = np.zeros_like(free)
-        for modulus, matrix in zip(moduli, self.free_stiffness, strict=True):  # their sum is copied at each addition
-            total += modulus * times(matrix, free)
+        largest, *others = sorted(zip(moduli, self.free_stiffness, strict=True), key=lambda pair: -pair[1].nnz)
+        total = times(largest[1], free)  # a sum of the matrices would be copied at each addition
+        total *= largest[0]
+        for modulus, matrix in others:
+            touched, within = touched_rows(matrix)
+            total[touched] += modulus * times(within, free)
         return total
 
     def boundary_loads(
@@ -417,6 +420,18 @@ def linear_model(
     elements = elements_of(space, LINEAR, dilatation) if material.n_modes else None
     model = LinearModel(space, conditions, regions, stiffness, free_stiffness, (), solver, weights, elements, material)
     return model.under(conditions)
+
+
+def touched_rows(matrix: sparse.csr_matrix[np.float64]) -> tuple[NDArray[np.int64], sparse.csr_matrix[np.float64]]:
+    """Numbers (n_touched,) of the rows of a matrix (n, m) that have entries; these rows, sharing the entries."""
+    touched = np.flatnonzero(np.diff(matrix.indptr))
+    within = sparse.csr_matrix((len(touched), matrix.shape[1]), dtype=matrix.dtype)
+    within.data, within.indices, within.indptr = (
+        matrix.data,
+        matrix.indices,
+        np.append(matrix.indptr[touched], matrix.nnz),
+    )
+    return touched, within
 
 
 def weighted_sum(

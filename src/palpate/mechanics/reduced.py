@@ -74,21 +74,24 @@ class ReducedModel:
             """Some of the outputs."""
             return np.asarray(sum((block[part] @ own for block, own in pairs[1:]), pairs[0][0][part] @ pairs[0][1]))
 
-        return np.concatenate(self._by_rows(rows, amplitudes.size))
+        return np.concatenate(self._by_rows(rows, len(self.output_modes), amplitudes.size))
 
-    def components(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Products (m,) or (m, k) of each basis vector's outputs with values (n_outputs,) or (n_outputs, k)."""
+    def components(self, values: NDArray[np.float64], rows: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
+        """Products (m,) or (m, k) of each basis vector's outputs with values (n_outputs,) or (n_outputs, k).
+
+        rows (n,): numbers of the outputs where alone there are values, (n,) or (n, k) then.
+        """
 
         def of_rows(part: slice) -> NDArray[np.float64]:
             """What some outputs add to them."""
-            return np.concatenate([block[part].T @ values[part] for block in self.output_basis])
+            own = part if rows is None else rows[part]
+            return np.concatenate([block[own].T @ values[part] for block in self.output_basis])
 
-        found = self._by_rows(of_rows, self.n_basis * values.size // max(len(values), 1))
+        found = self._by_rows(of_rows, len(values), self.n_basis * values.size // max(len(values), 1))
         return np.asarray(np.sum(found, axis=0))
 
-    def _by_rows(self, work: Callable[[slice], NDArray[np.float64]], numbers: int) -> list[NDArray[np.float64]]:
-        """What work makes of ranges of outputs, each by a thread where products with so many numbers are worth it."""
-        n = len(self.output_modes)
+    def _by_rows(self, work: Callable[[slice], NDArray[np.float64]], n: int, numbers: int) -> list[NDArray[np.float64]]:
+        """What work makes of ranges of n rows, each by a thread where products with so many numbers are worth it."""
         if n * numbers < WORTH_THREADS:
             return [work(slice(0, n))]
         return mapped(
@@ -229,8 +232,11 @@ class Projection:
         return np.asarray(self.model.constraint.free.T @ self.reduced.spanned(amplitudes))
 
     def components(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """V^T f (m, k) of f (n_free, k)."""
-        return self.reduced.components(np.asarray(self.model.constraint.free @ forces))
+        """V^T f (m, k) of f (n_free, k), of the rows alone that have any where these are few."""
+        values = np.asarray(self.model.constraint.free @ forces)
+        rows = np.flatnonzero(values.any(axis=1))
+        few = 2 * len(rows) < len(values)
+        return self.reduced.components(values[rows], rows) if few else self.reduced.components(values)
 
     def extended(self, snapshots: NDArray[np.float64]) -> Projection:
         """The projection on the span of the present vectors and of snapshots (n_free, k) mm.
@@ -248,10 +254,9 @@ class Projection:
         # once leaves the rounding of what it takes away
         fresh = orthonormal_basis(fresh - self.spanned(self.components(fresh)))
         model, old, blocks = self.model, self.reduced, []
-        images = [times(matrix, fresh) for matrix in model.free_stiffness]
-        sides = np.split(self.components(np.concatenate(images, axis=1)), len(images), axis=1)
-        for image, side, block in zip(images, sides, old.stiffness, strict=True):
-            corner = fresh.T @ image
+        for matrix, block in zip(model.free_stiffness, old.stiffness, strict=True):
+            image = times(matrix, fresh)
+            side, corner = self.components(image), fresh.T @ image
             blocks.append(np.block([[block, side], [side.T, 0.5 * (corner + corner.T)]]))
         reduced = replace(
             old,

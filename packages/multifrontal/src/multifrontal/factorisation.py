@@ -22,15 +22,16 @@ KEPT_PLANS = 2  # of the patterns that came last
 
 @dataclass(frozen=True, slots=True)
 class Factor:
-    """L of A = L L^T, its numbers (factor_size,) in single or double precision laid out as the plan says."""
+    """L of A / scale = L L^T, its numbers (factor_size,) in single or double precision laid out as the plan says."""
 
     plan: Plan
     numbers: Matrix
+    scale: float = 1.0
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         """A^-1 rhs for one right-hand side (n,) or several (n, m), to the rounding of the factor's precision."""
         with blas_on_one_thread():
-            found = substituted(self.plan, self.numbers, rhs[:, None] if rhs.ndim == 1 else rhs)
+            found = substituted(self.plan, self.numbers, rhs[:, None] if rhs.ndim == 1 else rhs, scale=self.scale)
         return found.reshape(rhs.shape)
 
 
@@ -68,13 +69,16 @@ def analyse(matrix: sparse.csr_matrix[np.float64], *, threads: int | None = None
 def factorise(matrix: sparse.csr_matrix[np.float64], *, dtype: type = np.float64, plan: Plan | None = None) -> Factor:
     """The factor of the symmetric positive definite `matrix` (n, n), both of its triangles stored.
 
-    dtype: np.float64, or np.float32 for half of the memory and nearly twice the speed; the matrix' entries must then
-    be in the range of single precision. plan: that of its pattern, by `analyse`. Raises `NotPositiveDefinite`.
+    dtype: np.float64, or np.float32 for half of the memory and nearly twice the speed; the largest entry is scaled to 1
+    then, for single precision has a small range. plan: that of its pattern, by `analyse`. Raises `NotPositiveDefinite`.
     """
-    canonical = _canonical(matrix)
-    known = analyse(canonical) if plan is None else plan
+    canonical, scale = _canonical(matrix), 1.0
+    known, entries = analyse(canonical) if plan is None else plan, canonical.data
+    if np.dtype(dtype) == np.float32:
+        scale = float(np.abs(entries).max(initial=0.0)) or 1.0
+        entries = entries / scale
     with blas_on_one_thread():
-        return Factor(known, factorised(known, canonical.data, dtype))
+        return Factor(known, factorised(known, entries, dtype), scale)
 
 
 def _canonical(matrix: sparse.csr_matrix[np.float64]) -> sparse.csr_matrix[np.float64]:

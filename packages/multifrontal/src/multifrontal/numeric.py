@@ -183,15 +183,22 @@ def _check(work: _Work, front: Front, pivot: int, before: int = 0) -> None:
         raise NotPositiveDefinite(len(work.plan.order), front.first + before + pivot)
 
 
-def substituted(plan: Plan, factor: Matrix, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """X (n, m) of L L^T X = rhs (n, m), computed in the type of the factor."""
+def substituted(plan: Plan, factor: Matrix, rhs: NDArray[np.float64], *, scale: float = 1.0) -> NDArray[np.float64]:
+    """X (n, m) of L L^T X = rhs (n, m) / scale, computed in the type of the factor.
+
+    In single precision, which has a small range, each right-hand side is brought to the size 1 meanwhile.
+    """
     n, m, threads = *rhs.shape, plan.threads
-    result = np.empty(rhs.shape)
+    result, parts = np.empty(rhs.shape), [slice(start, start + ROWS) for start in range(0, n, ROWS)]
     ends = np.linspace(0, m, max(-(-m // (LARGEST_BLOCK * threads)), 1) + 1).astype(int).tolist()
     for begin, end in pairwise(ends):
+        sizes = np.ones(end - begin)
+        if factor.dtype == np.float32:
+            sizes = np.max([np.abs(rhs[part, begin:end]).max(axis=0) for part in parts], axis=0, initial=0.0)
+            sizes = np.maximum(sizes, np.finfo(np.float64).tiny)
         x = np.empty((n, end - begin), factor.dtype)
-        for some in (slice(start, start + ROWS) for start in range(0, n, ROWS)):
-            x[some] = rhs[plan.order[some], begin:end]
+        for some in parts:  # what is put in order stays in the cache until it is scaled
+            x[some] = rhs[plan.order[some], begin:end] / sizes
         if end - begin <= FEW:
             x = _one_by_one(plan, factor, x)
         elif threads == 1:
@@ -199,7 +206,8 @@ def substituted(plan: Plan, factor: Matrix, rhs: NDArray[np.float64]) -> NDArray
             _backward(plan.fronts, factor, x)
         else:
             _side_by_side(plan, factor, x)
-        result[plan.order, begin:end] = x
+        for some in parts:
+            result[plan.order[some], begin:end] = x[some] * (sizes / scale)
     return result
 
 

@@ -47,18 +47,14 @@ class DirectFactorisation:
 
 @dataclass(frozen=True, slots=True)
 class MixedFactorisation:
-    """A factor in single precision of the matrix over `scale`, and conjugate gradients with the matrix in double."""
+    """A factor in single precision, and conjugate gradients with the matrix in double."""
 
     matrix: sparse.csr_matrix[np.float64]
     factor: multifrontal.Factor
-    scale: float
 
     def nearly(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         """A^-1 rhs (n, m) to single precision."""
-        sizes = np.maximum(np.abs(rhs).max(axis=0, initial=0.0), np.finfo(np.float64).tiny)  # single has a small range
-        solution = self.factor.solve(rhs / sizes)
-        solution *= sizes / self.scale
-        return solution
+        return self.factor.solve(rhs)
 
     def solve(self, rhs: NDArray[np.float64], *, tolerance: float = EXACT) -> NDArray[np.float64]:
         """Solution X (n, m) of A X = rhs (n, m) to a relative residual of `tolerance`; raises `SolverError`."""
@@ -93,10 +89,8 @@ def _factorise(matrix: sparse.csr_matrix[np.float64], hints: Hints) -> Factorisa
 
 def _factorise_mixed(matrix: sparse.csr_matrix[np.float64], hints: Hints) -> Factorisation:
     """In single precision; in double where rounding makes that indefinite, or its refinement slow."""
-    scale = float(np.abs(matrix.data).max(initial=0.0)) or 1.0
     try:
-        scaled = sparse.csr_matrix((matrix.data / scale, matrix.indices, matrix.indptr), shape=matrix.shape)
-        mixed = MixedFactorisation(matrix, _factor(scaled, np.float32), scale)
+        mixed = MixedFactorisation(matrix, _factor(matrix, np.float32))
         mixed.solve(np.random.default_rng(0).standard_normal((matrix.shape[0], 1)))
     except SolverError:
         return _factorise(matrix, hints)
