@@ -103,6 +103,18 @@ def test_single_precision_is_near_and_refined_by_conjugate_gradients(body):
     assert relative_residual(body, found[:, None], rhs[:, None]) < 1e-11
 
 
+@pytest.mark.parametrize("unit", [1e-60, 1.0, 1e60])
+@pytest.mark.parametrize("columns", [3, 9])
+def test_single_precision_has_the_range_of_double(body, unit, columns):
+    rhs = np.random.default_rng(5).standard_normal((body.shape[0], columns)) * np.logspace(-80.0, 80.0, columns)
+    found = multifrontal.factorise(unit * body, dtype=np.float32).solve(rhs)
+    assert relative_residual(unit * body, found, rhs) < 1e-3
+
+
+def test_a_right_hand_side_of_nothing_has_no_answer_but_nothing(body):
+    assert not np.any(multifrontal.factorise(body, dtype=np.float32).solve(np.zeros((body.shape[0], 2))))
+
+
 def test_one_right_hand_side_may_be_a_vector(body):
     factor, rhs = multifrontal.factorise(body), np.random.default_rng(2).standard_normal((body.shape[0], 3))
     assert np.allclose(factor.solve(rhs[:, 1]), factor.solve(rhs)[:, 1], rtol=1e-12, atol=0)
