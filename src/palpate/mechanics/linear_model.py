@@ -426,11 +426,8 @@ def touched_rows(matrix: sparse.csr_matrix[np.float64]) -> tuple[NDArray[np.int6
     """Numbers (n_touched,) of the rows of a matrix (n, m) that have entries; these rows, sharing the entries."""
     touched = np.flatnonzero(np.diff(matrix.indptr))
     within = sparse.csr_matrix((len(touched), matrix.shape[1]), dtype=matrix.dtype)
-    within.data, within.indices, within.indptr = (
-        matrix.data,
-        matrix.indices,
-        np.append(matrix.indptr[touched], matrix.nnz),
-    )
+    within.data, within.indices = matrix.data, matrix.indices
+    within.indptr = np.append(matrix.indptr[touched], matrix.indptr[-1:])
     return touched, within
 
 
