@@ -75,6 +75,14 @@ def test_what_is_prescribed_is_met_exactly(model, rng):
     assert np.array_equal(model.solve(MODULI, coefficients).values[moved], given[moved])
 
 
+def test_forces_on_free_points_are_those_of_all_tissues_stiffness(model, rng):
+    moduli = rng.uniform(1.0, 30.0, model.n_regions)
+    motion = rng.standard_normal((model.constraint.free.shape[1], 3))
+    whole = model.constraint.free.T @ model.forces(moduli, model.constraint.free @ motion)
+    found = model.free_forces(moduli, motion)
+    assert np.allclose(found, whole, rtol=0.0, atol=1e-12 * np.abs(whole).max())
+
+
 def test_free_points_feel_no_force(model, rng):
     u = model.solve(MODULI, rng.standard_normal(3)).values[:, None]
     reactions = model.forces(MODULI, u)

@@ -131,6 +131,8 @@ def test_what_is_added_copies_nothing_and_spans_with_what_is_there_by_any_thread
         amplitudes, values = rng.standard_normal((7, *shape)), rng.standard_normal((len(whole), *shape))
         assert np.allclose(grown.reduced.spanned(amplitudes), whole @ amplitudes, atol=1e-12)
         assert np.allclose(grown.reduced.components(values), whole.T @ values, atol=1e-12)
+        some = np.arange(0, len(whole), 3)
+        assert np.allclose(grown.reduced.components(values[some], some), whole[some].T @ values[some], atol=1e-12)
 
 
 def test_what_is_there_already_extends_nothing(model):
