@@ -52,7 +52,7 @@ test: style
 	wait $$types && exit $$tests
 
 # The demo, examples, notebooks and experiments as they are documented, and laws that take many estimates to be seen:
-# tests of over seven seconds each, a hundredth of all tests and two fifths of their time. Before a landing or a release.
+# tests of over seven seconds each, a hundredth of all tests. Before a landing or a release.
 acceptance: install
 	$(PYTEST) -m acceptance
 

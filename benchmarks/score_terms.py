@@ -13,7 +13,7 @@ in its posterior standard deviations sd:
   responses to the boundary modes, those of the reduced model, and to the material modes, those of the full model.
 
 Where a truth.json with "moduli_kpa" lies beside a case, as in the scenes of mismatch.py, the errors of ln E are told as
-they are and with these steps: with both terms (the whole likelihood), and with those of the material modes alone.
+they are, with the steps by the material modes' responses, and with all three.
 
 Derivatives are central differences over 0.2 of sd and of ln E.
 """
@@ -78,7 +78,8 @@ def measured(inversion: Inversion) -> dict[str, Any]:
     covariance = of.minimum.evaluation.covariance_columns(n)
     sd = np.sqrt(np.diag(covariance[:n]))
     lacking = -np.array([of.pull_lacking(covariance[:, i] / sd[i]) for i in range(n)])
-    slopes = np.array([of.determinant_slopes(i) for i in range(n)])
+    here = of.tangent(of.minimum.unknowns)
+    slopes = np.array([of.determinant_slopes(i, here) for i in range(n)])
     steps = [lacking, *(-covariance[:n] @ slopes / sd[:, None]).T]
     return {**{term: step.tolist() for term, step in zip(TERMS, steps, strict=True)}, "sd": sd.tolist()}
 
@@ -151,11 +152,14 @@ class _Estimate:
             pull += float(moved @ (term.precision * term.weights * term.residuals.values))
         return pull
 
-    def determinant_slopes(self, i: int) -> tuple[float, float]:
-        """Derivatives of 1/2 ln det H_nn by the i-th log-modulus, by responses to boundary and to material modes."""
+    def determinant_slopes(self, i: int, here: NDArray[np.float64]) -> tuple[float, float]:
+        """Derivatives of 1/2 ln det H_nn by the i-th log-modulus, by responses to boundary and to material modes.
+
+        here (n_dof, n_regions + n_modes) mm: the tangent at the minimum, of which either part is held.
+        """
         step = np.where(np.arange(len(self.minimum.unknowns)) == i, STEP, 0.0)
         ends = [self.minimum.unknowns + sign * step for sign in (1.0, -1.0)]
-        here, there = self._tangent(self.minimum.unknowns), [self._tangent(end) for end in ends]
+        there = [self.tangent(end) for end in ends]
         first, found = len(self.objective.parameters.base) + self.basis.constraint.n_modes, []
         for changes in (slice(0, first), slice(first, None)):
             values = []
@@ -166,7 +170,7 @@ class _Estimate:
             found.append(0.5 * (values[0] - values[1]) / (2.0 * STEP))
         return found[0], found[1]
 
-    def _tangent(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+    def tangent(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives (n_dof, n_regions + n_modes) mm by ln E and coefficients at unknowns (n_unknowns,)."""
         parameters, boundary = self.objective.parameters, self.basis.constraint.n_modes
         moduli, q = parameters.moduli(unknowns), parameters.coefficients(unknowns)[0]

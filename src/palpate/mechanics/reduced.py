@@ -16,7 +16,7 @@ from scipy import linalg, sparse
 
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.forward import DenseEquilibrium, Outputs, checked_coefficients, checked_moduli
-from palpate.mechanics.linear_model import LinearModel
+from palpate.mechanics.linear_model import LinearModel, touched_rows
 from palpate.mechanics.solvers.conjugate_gradients import WORTH_THREADS, column_norms, times
 from palpate.parallel import mapped, processors
 
@@ -290,12 +290,12 @@ def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection
 
 def _projected(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """V^T A V (m, m) for V (n, m) and a symmetric A (n, n) that is empty but for some rows and columns."""
-    touched, m = np.flatnonzero(np.diff(matrix.indptr)), vectors.shape[1]
+    touched, within = touched_rows(matrix)
     number = np.zeros(len(vectors), dtype=matrix.indices.dtype)  # of each row among those
     number[touched] = np.arange(len(touched))
-    ends, shape = np.append(matrix.indptr[touched], matrix.nnz), (len(touched), len(touched))
-    within, rows = sparse.csr_matrix((matrix.data, number[matrix.indices], ends), shape=shape), vectors[touched]
-    parts = [slice(start, start + CHUNK) for start in range(0, m, CHUNK)]
+    entries, shape = (within.data, number[within.indices], within.indptr), (len(touched), len(touched))
+    within, rows = sparse.csr_matrix(entries, shape=shape), vectors[touched]
+    parts = [slice(start, start + CHUNK) for start in range(0, vectors.shape[1], CHUNK)]
     products = mapped(lambda part: rows.T @ np.asarray(within @ np.ascontiguousarray(rows[:, part])), parts)
     projected = np.concatenate(products, axis=1)
     return np.asarray(0.5 * (projected + projected.T))
