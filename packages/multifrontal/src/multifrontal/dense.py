@@ -120,12 +120,11 @@ def subtract_square(c: Matrix, a: Matrix, *, keep: float = 1.0) -> None:
     )  # fmt: skip
 
 
-def subtract_product(c: Matrix, a: Matrix, b: Matrix, *, transposed: bool = True, keep: float = 1.0) -> None:
-    """Keep C - A B^T in place of C (m, n), A (m, k), B (n, k), or with A B, B (k, n); keep: 0 or 1."""
+def subtract_product(c: Matrix, a: Matrix, b: Matrix, *, keep: float = 1.0) -> None:
+    """Keep C - A B^T in place of C (m, n), A (m, k), B (n, k); keep: 0 or 1."""
     _ROUTINES["gemm", c.dtype](
-        b"N", b"T" if transposed else b"N", _dimension(c.shape[0]), _dimension(c.shape[1]), _dimension(a.shape[1]),
-        _scalar(c.dtype, -1.0), address(a), _leading(a), address(b), _leading(b), _scalar(c.dtype, keep), address(c),
-        _leading(c),
+        b"N", b"T", _dimension(c.shape[0]), _dimension(c.shape[1]), _dimension(a.shape[1]), _scalar(c.dtype, -1.0),
+        address(a), _leading(a), address(b), _leading(b), _scalar(c.dtype, keep), address(c), _leading(c),
     )  # fmt: skip
 
 

@@ -1,7 +1,7 @@
-"""The factor's numbers, and solutions with them: fronts one after the other, subtrees of them side by side.
+"""The factor's numbers, subtrees of fronts side by side, and solutions with them, one front after the other.
 
-A solution reads the factor from memory once a way, by however many threads: for few right-hand sides that is all that
-counts. So subtrees are met by all right-hand sides at once, and the fronts above by each thread with its own.
+A solution reads the factor from memory once a way, by however many threads, and what surrounds its calls on small
+fronts takes as long as these: threads would wait for Python's lock, and products by NumPy cost least.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ __all__ = ["NotPositiveDefinite", "factorised", "substituted"]
 
 BLOCK = 256  # columns of a large front that are eliminated before the others hear of them
 Everywhere = Callable[[Callable[[Any], None], Iterable[Any]], None]
-FEW = 6  # right-hand sides up to which one at a time is fastest: the products of several have no kernel for so few
-CACHE = 1 << 19  # bytes of a front that are met by all of these while they lie in the cache
+FEW = 3  # right-hand sides up to which one at a time is fastest: the products of several have no kernel for so few
+SHARED = 32  # right-hand sides from which on threads share the large fronts: for fewer it takes as long
 ROWS = 2048  # of right-hand sides that are put in order while they lie in the cache
 LARGEST_BLOCK = 64  # right-hand sides of a thread; more at once are not faster and take more memory
 
@@ -200,8 +200,8 @@ def substituted(plan: Plan, factor: Matrix, rhs: NDArray[np.float64], *, scale: 
         for some in parts:  # what is put in order stays in the cache until it is scaled
             x[some] = rhs[plan.order[some], begin:end] / sizes
         if end - begin <= FEW:
-            x = _one_by_one(plan, factor, x)
-        elif threads == 1:
+            _one_by_one(plan, factor, x)
+        elif threads == 1 or end - begin < SHARED:
             _forward(plan.fronts, factor, x)
             _backward(plan.fronts, factor, x)
         else:
@@ -211,125 +211,97 @@ def substituted(plan: Plan, factor: Matrix, rhs: NDArray[np.float64], *, scale: 
     return result
 
 
-def _one_by_one(plan: Plan, factor: Matrix, rhs: Matrix) -> Matrix:
-    """L^-T L^-1 rhs (n, m) of few right-hand sides, in the order of elimination, by one thread.
-
-    Threads would wait for Python's lock longer than they compute.
-    """
-    x = np.ascontiguousarray(rhs.T)
-    above = np.empty((len(x), max(len(front.rows) for front in plan.fronts)), x.dtype)
-    places = tuple((dense.address(own), dense.address(rows)) for own, rows in zip(x, above, strict=True))
-    few = _Few(dense.Vectors.of(factor.dtype), dense.address(factor), factor.itemsize, tuple(x), tuple(above), places)
-    for front in plan.fronts:
-        few.forward(front)
-    for front in reversed(plan.fronts):
-        few.backward(front)
-    return x.T
+def _one_by_one(plan: Plan, factor: Matrix, x: Matrix) -> None:
+    """L^-T L^-1 X in place of X (n, m) of few right-hand sides, in the order of elimination, by one thread."""
+    above = np.empty(max(len(front.rows) for front in plan.fronts), x.dtype)
+    for column in x.T:
+        single = np.ascontiguousarray(column)
+        places = dense.address(factor), dense.address(single), dense.address(above)
+        one = _One(dense.Vectors.of(factor.dtype), single, above, factor.itemsize, *places)
+        for front in plan.fronts:
+            one.forward(front)
+        for front in reversed(plan.fronts):
+            one.backward(front)
+        column[:] = single
 
 
 @dataclass(frozen=True, slots=True)
-class _Few:
-    """Few right-hand sides x (m of (n,)), met by a front one at a time, in parts of it that the cache holds meanwhile.
+class _One:
+    """One right-hand side x (n,), met by a front after the other.
 
-    above (m of (n_rows,)): what a front does to its rows, or has of them; places: addresses of x and above; factor: of
-    the factor, its numbers of `item` bytes.
+    above (n_rows,): what a front does to its rows, or has of them; at_factor, at_x, at_above: where the first of their
+    numbers lie, of `item` bytes each.
     """
 
     vectors: dense.Vectors
-    factor: int
+    x: Matrix
+    above: Matrix
     item: int
-    x: tuple[Matrix, ...]
-    above: tuple[Matrix, ...]
-    places: tuple[tuple[int, int], ...]
+    at_factor: int
+    at_x: int
+    at_above: int
 
     def forward(self, front: Front) -> None:
         """What L^-1 does by this front."""
-        size, below = front.size, len(front.rows)
-        for begin, end, corner in self._stretches(front):
-            n, rest, ahead = end - begin, front.width - end, self.item * (end - begin)
-            for own, change in self.places:
-                here = own + self.item * (front.first + begin)
-                self.vectors.solve(False, n, corner, size, here)
-                if rest:
-                    self.vectors.subtract(False, (rest, n), corner + ahead, size, here, here + ahead, keep=True)
-                if below:
-                    rows = corner + self.item * (front.width - begin)
-                    self.vectors.subtract(False, (below, n), rows, size, here, change, keep=begin > 0)
+        size, width, below, corner, own = self._places(front)
+        self.vectors.solve(False, width, corner, size, own)
         if below:
-            for x, above in zip(self.x, self.above, strict=True):  # both axes at once would take twice as long
-                x[front.rows] += above[:below]
+            rows = corner + self.item * width
+            self.vectors.subtract(False, (below, width), rows, size, own, self.at_above, keep=False)
+            self.x[front.rows] += self.above[:below]
 
     def backward(self, front: Front) -> None:
         """What L^-T does by this front."""
-        size, below = front.size, len(front.rows)
-        for x, above in zip(self.x, self.above, strict=True):
-            above[:below] = x[front.rows]
-        for begin, end, corner in reversed(self._stretches(front)):
-            n, rest, ahead = end - begin, front.width - end, self.item * (end - begin)
-            for own, held in self.places:
-                here = own + self.item * (front.first + begin)
-                if below:
-                    rows = corner + self.item * (front.width - begin)
-                    self.vectors.subtract(True, (below, n), rows, size, held, here, keep=True)
-                if rest:
-                    self.vectors.subtract(True, (rest, n), corner + ahead, size, here + ahead, here, keep=True)
-                self.vectors.solve(True, n, corner, size, here)
+        size, width, below, corner, own = self._places(front)
+        if below:
+            self.above[:below] = self.x[front.rows]
+            rows = corner + self.item * width
+            self.vectors.subtract(True, (below, width), rows, size, self.at_above, own, keep=True)
+        self.vectors.solve(True, width, corner, size, own)
 
-    def _stretches(self, front: Front) -> list[tuple[int, int, int]]:
-        """First and last columns that are met together, and where their part of the diagonal begins."""
-        at_once = front.width if len(self.x) == 1 else max(CACHE // (self.item * front.size), 1)
-        first = self.factor + self.item * front.panel
-        return [
-            (begin, min(begin + at_once, front.width), first + self.item * begin * (front.size + 1))
-            for begin in range(0, front.width, at_once)
-        ]
+    def _places(self, front: Front) -> tuple[int, int, int, int, int]:
+        """Rows and columns of a front, its rows below them, where its columns and its own part of x begin."""
+        corner, own = self.at_factor + self.item * front.panel, self.at_x + self.item * front.first
+        return front.size, front.width, len(front.rows), corner, own
 
 
 def _side_by_side(plan: Plan, factor: Matrix, x: Matrix) -> None:
-    """L^-T L^-1 X in place of X (n, m), rows in the order of elimination."""
-    subtrees = [plan.fronts[subtree.start : subtree.stop] for step in plan.steps for subtree in step.subtrees]
+    """L^-T L^-1 X in place of X (n, m), rows in the order of elimination, large fronts by threads with some columns each.
+
+    Subtrees, of small fronts, by one: several would wait for Python's lock longer than they compute.
+    """
+    subtrees = [front for step in plan.steps for s in step.subtrees for front in plan.fronts[s.start : s.stop]]
     above = [plan.fronts[s] for step in plan.steps for s in step.then]
     ends = np.linspace(0, x.shape[1], min(plan.threads, x.shape[1]) + 1).astype(int).tolist()
 
-    def up(subtree: tuple[Front, ...]) -> tuple[NDArray[np.int64], Matrix]:
-        """The subtree's own rows in their place; what it changes above (its root's rows), and by how much."""
-        own, root = slice(subtree[0].first, subtree[-1].first + subtree[-1].width), subtree[-1]
-        alone = np.zeros(x.shape, x.dtype)  # only the pages that are written are ever taken
-        alone[own] = x[own]
-        _forward(subtree, factor, alone)
-        x[own] = alone[own]
-        return root.rows, alone[root.rows]
-
     def over(columns: tuple[int, int]) -> None:
         """The fronts above all subtrees, for some of the right-hand sides."""
-        part = x[:, slice(*columns)]
+        part = np.ascontiguousarray(x[:, slice(*columns)])
         _forward(above, factor, part)
         _backward(above, factor, part)
+        x[:, slice(*columns)] = part
 
+    _forward(subtrees, factor, x)
     with pool_of(plan.threads) as pool:
-        for rows, change in pool.map(up, subtrees):
-            x[rows] += change
         list(pool.map(over, pairwise(ends)))
-        list(pool.map(lambda subtree: _backward(subtree, factor, x), subtrees))
+    _backward(subtrees, factor, x)
 
 
 def _forward(fronts: Iterable[Front], factor: Matrix, x: Matrix) -> None:
     """What L^-1 does to X (n, m) by these fronts, children before their parents."""
     for front in fronts:
         panel, own = panel_of(factor, front), x[front.first : front.first + front.width]
-        triangle, rest = panel[: front.width], panel[front.width :]
-        dense.solve_transposed(triangle, own.T)
-        change = np.empty((len(rest), x.shape[1]), x.dtype)
-        if len(rest):
-            dense.subtract_product(change.T, own.T, rest, keep=0.0)
-        x[front.rows] += change
+        dense.solve_transposed(panel[: front.width], own.T)
+        if len(front.rows):
+            above = x.take(front.rows, axis=0)  # x[rows] takes four times as long
+            above -= panel[front.width :] @ own
+            x[front.rows] = above
 
 
 def _backward(fronts: Iterable[Front], factor: Matrix, x: Matrix) -> None:
     """What L^-T does to X (n, m) by these fronts, parents before their children."""
     for front in reversed(tuple(fronts)):
         panel, own = panel_of(factor, front), x[front.first : front.first + front.width]
-        triangle, rest = panel[: front.width], panel[front.width :]
-        if len(rest):
-            dense.subtract_product(own.T, x[front.rows].T, rest, transposed=False)
-        dense.solve_right(triangle, own.T)
+        if len(front.rows):
+            own -= panel[front.width :].T @ x.take(front.rows, axis=0)
+        dense.solve_right(panel[: front.width], own.T)
