@@ -110,7 +110,7 @@ class ReducedBasis:
                 cost += SolveCounts(tangent=along.number)
             last = new + along.boundary.shape[1]
             material = _changed(along.material, at.metric, missing[:, last:], every=every)
-            responses = self.model.output_material + np.asarray(model.constraint.free @ material)
+            responses = self.model.output_material + times(model.constraint.free, material)
             sharper = sharper.with_material(responses, at.moduli if every else self.material_at)
             sharper = _extended(replace(sharper, place=at), missing[:, :last], cost)
         return sharper
@@ -247,14 +247,13 @@ class _Directions:
 
 def reduced_basis(model: LinearModel, moduli: NDArray[np.float64]) -> ReducedBasis:
     """The model on its responses to every boundary mode at moduli (n_regions,) kPa; one factorisation."""
-    system = model.system(moduli)
-    return basis_of(system, system.responses(tolerance=SNAPSHOT), system.response_counts)
+    system, free = model.system(moduli), sparse.csr_matrix(model.constraint.free.T)
+    return basis_of(system, times(free, system.responses(tolerance=SNAPSHOT)), system.response_counts)
 
 
-def basis_of(system: LinearSystem, responses: NDArray[np.float64], counts: SolveCounts) -> ReducedBasis:
-    """A system's model on displacements (n_dof, k) mm that are there, with what they, and the system, cost."""
-    snapshots = times(sparse.csr_matrix(system.model.constraint.free.T), responses)
-    return ReducedBasis(projection(system.model, snapshots), system, counts)
+def basis_of(system: LinearSystem, snapshots: NDArray[np.float64], counts: SolveCounts) -> ReducedBasis:
+    """A system's model on free displacements (n_free, k) mm, which are overwritten, with what these, and it, cost."""
+    return ReducedBasis(projection(system.model, snapshots, overwrite=True), system, counts)
 
 
 def _changed(

@@ -22,8 +22,7 @@ from palpate.parallel import mapped, processors
 
 RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
 WELL_CONDITIONED = 1e-12  # of the Gram matrix' largest eigenvalue: above it Cholesky's factor orthogonalises safely
-CHUNK = 32  # basis vectors multiplied with a stiffness at once
-ROWS = 4096  # of them, made orthogonal at once
+ROWS = 2048  # of basis vectors, made orthogonal or multiplied with a stiffness at once, in the cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +232,7 @@ class Projection:
 
     def components(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """V^T f (m, k) of f (n_free, k), of the rows alone that have any where these are few."""
-        values = np.asarray(self.model.constraint.free @ forces)
+        values = times(self.model.constraint.free, forces)
         rows = np.flatnonzero(values.any(axis=1))
         few = 2 * len(rows) < len(values)
         return self.reduced.components(values[rows], rows) if few else self.reduced.components(values)
@@ -250,9 +249,9 @@ class Projection:
         fresh = fresh[:, column_norms(fresh) > RANK_TOLERANCE]
         if not fresh.shape[1]:
             return self
-        fresh = orthonormal_basis(fresh)
+        fresh = orthonormal_basis(fresh, overwrite=True)
         # once leaves the rounding of what it takes away
-        fresh = orthonormal_basis(fresh - self.spanned(self.components(fresh)))
+        fresh = orthonormal_basis(fresh - self.spanned(self.components(fresh)), overwrite=True)
         model, old, blocks = self.model, self.reduced, []
         for matrix, block in zip(model.free_stiffness, old.stiffness, strict=True):
             image = times(matrix, fresh)
@@ -263,7 +262,7 @@ class Projection:
             stiffness=np.stack(blocks),
             coupling=np.concatenate([old.coupling, _coupling(model, fresh)], axis=1),
             load=np.concatenate([old.load, fresh.T @ model.free_load]),
-            output_basis=(*old.output_basis, np.asarray(model.constraint.free @ fresh)),
+            output_basis=(*old.output_basis, times(model.constraint.free, fresh)),
         )
         return Projection(model, reduced)
 
@@ -272,15 +271,16 @@ class Projection:
         return replace(self, reduced=replace(self.reduced, output_material=responses))
 
 
-def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection:
+def projection(model: LinearModel, snapshots: NDArray[np.float64], *, overwrite: bool = False) -> Projection:
     """Project `model` on the span of `snapshots` (n_free, k), free coordinates F^T u of displacements u, mm.
 
-    They are made orthonormal and their rank cut; raises `ConfigurationError` when their rows are not n_free.
+    They are made orthonormal, in their place if it may be overwritten, and their rank cut; raises `ConfigurationError`
+    when their rows are not n_free.
     """
-    vectors = orthonormal_basis(_checked(model, snapshots))
+    vectors = orthonormal_basis(_checked(model, snapshots), overwrite=overwrite)
     stiffness = np.stack([_projected(matrix, vectors) for matrix in model.free_stiffness])
     load, coupling = np.asarray(vectors.T @ model.free_load), _coupling(model, vectors)
-    outputs, constraint = np.asarray(model.constraint.free @ vectors), model.constraint
+    outputs, constraint = times(model.constraint.free, vectors), model.constraint
     none = np.zeros((len(outputs), model.material.n_modes))
     reduced = ReducedModel(
         model.names, stiffness, coupling, load, (outputs,), constraint.modes, constraint.offset, none
@@ -291,19 +291,20 @@ def projection(model: LinearModel, snapshots: NDArray[np.float64]) -> Projection
 def _projected(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """V^T A V (m, m) for V (n, m) and a symmetric A (n, n) that is empty but for some rows and columns."""
     touched, within = touched_rows(matrix)
-    number = np.zeros(len(vectors), dtype=matrix.indices.dtype)  # of each row among those
-    number[touched] = np.arange(len(touched))
-    entries, shape = (within.data, number[within.indices], within.indptr), (len(touched), len(touched))
-    within, rows = sparse.csr_matrix(entries, shape=shape), vectors[touched]
-    parts = [slice(start, start + CHUNK) for start in range(0, vectors.shape[1], CHUNK)]
-    products = mapped(lambda part: rows.T @ np.asarray(within @ np.ascontiguousarray(rows[:, part])), parts)
-    projected = np.concatenate(products, axis=1)
+
+    def some(part: slice) -> NDArray[np.float64]:
+        """What some of the rows add to it."""
+        return np.asarray(vectors[touched[part]].T @ (within[part] @ vectors))
+
+    parts = [slice(start, start + ROWS) for start in range(0, len(touched), ROWS)]
+    projected = np.sum(mapped(some, parts), axis=0)
     return np.asarray(0.5 * (projected + projected.T))
 
 
-def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
+def orthonormal_basis(snapshots: NDArray[np.float64], *, overwrite: bool = False) -> NDArray[np.float64]:
     """Orthonormal columns (n, m) that span the snapshots (n, k), each first scaled to length 1.
 
+    overwrite: whether they may take the snapshots' place: a second copy would be among the largest arrays there are.
     Directions below 1e-10 of the largest singular value are dropped; raises `ConfigurationError` when none is left.
     Cholesky factors of the Gram matrix, taken twice, where it is well conditioned (Yamamoto et al., Electron. Trans.
     Numer. Anal. 44 (2015) 306-326), else Householder's QR.
@@ -312,13 +313,14 @@ def orthonormal_basis(snapshots: NDArray[np.float64]) -> NDArray[np.float64]:
     if snapshots.ndim != 2 or not np.all(np.isfinite(lengths)) or not np.any(lengths > 0.0):
         raise ConfigurationError(f"a reduced basis needs finite, non-zero snapshots (n, k); got {snapshots.shape}")
     moving = np.flatnonzero(lengths)
-    vectors = snapshots if len(moving) == len(lengths) else np.take(snapshots, moving, axis=1)
-    scale, found = 1.0 / lengths[moving], np.empty(vectors.shape)
+    whole = len(moving) == len(lengths)
+    vectors = snapshots if whole else np.take(snapshots, moving, axis=1)
+    scale = 1.0 / lengths[moving]
     gram = scale[:, None] * _gram(vectors) * scale
     sizes = np.linalg.eigvalsh(gram)
     if sizes[0] > WELL_CONDITIONED * sizes[-1]:
-        for again in (False, True):
-            # V R^-1 in place of V, with V^T V = R^T R: a second copy would be among the largest there are
+        found = vectors if overwrite or not whole else np.empty(vectors.shape)
+        for again in (False, True):  # V R^-1 in place of V, with V^T V = R^T R
             factor = linalg.cholesky(_gram(found) if again else gram, check_finite=False)
             inverse = linalg.solve_triangular(factor, np.eye(len(factor)), check_finite=False)
             given, by = (found, inverse) if again else (vectors, scale[:, None] * inverse)

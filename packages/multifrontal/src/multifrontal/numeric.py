@@ -266,7 +266,7 @@ class _One:
 
 
 def _side_by_side(plan: Plan, factor: Matrix, x: Matrix) -> None:
-    """L^-T L^-1 X in place of X (n, m), rows in the order of elimination, large fronts by threads with some columns each.
+    """L^-T L^-1 X in place of X (n, m), rows in the order of elimination; threads share the columns in large fronts.
 
     Subtrees, of small fronts, by one: several would wait for Python's lock longer than they compute.
     """

@@ -13,6 +13,7 @@ from palpate.errors import SolverError
 from palpate.parallel import mapped, processors
 
 WORTH_THREADS = 3_000_000  # products; below, handing them to a thread takes longer than it spares
+PART = 2**20  # bytes of a product that are made at once: the system fills what SciPy takes for more with zeros each time
 ROOM = 2**29  # bytes of the vectors of columns that are iterated together
 VECTORS = 8  # that a column takes
 FEWEST = 32  # columns together, below which products with a factor are slow
@@ -22,22 +23,23 @@ Product = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # of a matrix (n
 
 def times(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """A X (n, k) for A (n, m) and X (m, k), in the unit of their products."""
-    if matrix.nnz * vectors.shape[1] < WORTH_THREADS or processors() == 1:
+    if matrix.nnz * vectors.shape[1] < WORTH_THREADS:
         return np.asarray(matrix @ vectors)
-    together = np.ascontiguousarray(vectors)
+    together, found = np.ascontiguousarray(vectors), np.empty((matrix.shape[0], vectors.shape[1]))
 
-    def rows(part: tuple[int, int]) -> NDArray[np.float64]:
+    def rows(part: tuple[int, int]) -> None:
         """Those of the product from the first to before the last."""
         begin, end = part
         entries = slice(int(matrix.indptr[begin]), int(matrix.indptr[end]))
         own = sparse.csr_matrix((end - begin, matrix.shape[1]))  # which would copy the entries, were it made of them
         own.data, own.indices = matrix.data[entries], matrix.indices[entries]
         own.indptr = matrix.indptr[begin : end + 1] - matrix.indptr[begin]
-        return np.asarray(own @ together)
+        found[begin:end] = own @ together
 
-    share_of = np.linspace(0, matrix.nnz, processors() + 1)[1:-1]
+    share_of = np.linspace(0, matrix.nnz, max(processors(), found.nbytes // PART) + 1)[1:-1]
     ends = [0, *np.searchsorted(matrix.indptr, share_of).tolist(), matrix.shape[0]]
-    return np.concatenate(mapped(rows, pairwise(ends)))
+    mapped(rows, pairwise(ends))
+    return found
 
 
 def column_norms(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
