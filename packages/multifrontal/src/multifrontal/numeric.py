@@ -288,18 +288,19 @@ def _side_by_side(plan: Plan, factor: Matrix, x: Matrix) -> None:
 
 
 def _forward(fronts: Iterable[Front], factor: Matrix, x: Matrix) -> None:
-    """What L^-1 does to X (n, m) by these fronts, children before their parents."""
+    """What L^-1 does to X (n, m), its rows contiguous, by these fronts, children before their parents."""
+    whole_rows = x.view(np.dtype((np.void, x.itemsize * x.shape[1])))[:, 0]
     for front in fronts:
         panel, own = panel_of(factor, front), x[front.first : front.first + front.width]
         dense.solve_transposed(panel[: front.width], own.T)
         if len(front.rows):
             above = x.take(front.rows, axis=0)  # x[rows] takes four times as long
             above -= panel[front.width :] @ own
-            x[front.rows] = above
+            whole_rows.put(front.rows, above.view(whole_rows.dtype))
 
 
 def _backward(fronts: Iterable[Front], factor: Matrix, x: Matrix) -> None:
-    """What L^-T does to X (n, m) by these fronts, parents before their children."""
+    """What L^-T does to X (n, m), its rows contiguous, by these fronts, parents before their children."""
     for front in reversed(tuple(fronts)):
         panel, own = panel_of(factor, front), x[front.first : front.first + front.width]
         if len(front.rows):
