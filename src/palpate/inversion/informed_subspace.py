@@ -113,12 +113,12 @@ class _Responses:
         """The reduced basis of combinations (n_boundary, k) and (n_material, l), of which `model` is made."""
         own = np.eye(1, int(np.any(self.boundary[:, -1])))  # that of offset and loads, where there are any
         every = linalg.block_diag(boundary, own).astype(np.float32)
-        free = sparse.csr_matrix(model.constraint.free.T, dtype=np.float32)
+        free = sparse.csr_matrix(model.constraint.free.T).astype(np.float32)
         snapshots = np.empty((free.shape[0], every.shape[1]))
 
         def fill(rows: slice) -> None:
             """Some rows of the free displacements, which are among the largest arrays there are."""
-            snapshots[rows] = (free[rows] @ self.boundary) @ every
+            snapshots[rows] = np.asarray(free[rows] @ self.boundary) @ every
 
         mapped(fill, [slice(start, start + ROWS) for start in range(0, len(snapshots), ROWS)])
         cost = self.system.response_counts + SolveCounts(tangent=self.material.shape[1])

@@ -385,47 +385,44 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
 
 
 def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule) -> tuple[OuterIterate, int]:
-    """The objective at the end of a step, its model made exact there where its error matters; the evaluations spent."""
+    """The objective at the end of a step, its model made exact there where its error matters; the evaluations spent.
+
+    Where derivatives that decide are of too far away it is made exact in any case: after a step shorter than a standard
+    deviation at once, along what decides by the linear residuals.
+    """
     n, before, unknowns = step.objective.n_parameters, now.minimum, step.minimum.unknowns
-    objective = step.objective.rematched(unknowns)
-    asked, left = bool(np.isfinite(rule.model_error)), 0.0
+    objective, minimum = step.objective.rematched(unknowns), replace(step.minimum, outcome=Outcome.STEPS)
+    asked, checks, spent, left, missing = np.isfinite(rule.model_error), now.checks, 0, 0.0, 0.0
     if asked and rule.derivatives:
         left = linearisation_distance(objective, unknowns) / rule.step_sd
-        asked = left < 1.0  # else it is made exact in any case
-    evaluation, errors = both(lambda: objective(unknowns), lambda: model_errors(objective, unknowns) if asked else [])
-    minimum, spent = replace(step.minimum, evaluation=evaluation, outcome=Outcome.STEPS), 1
-    tolerance = rule.tolerance(minimum, n)
-
-    def size(steps: Sequence[NDArray[np.float64]]) -> float:
-        """The furthest that one of them (n_unknowns,) moves a log-modulus, over what it may."""
-        return max(float(np.max(np.abs(d[:n]) / tolerance, initial=0.0)) for d in steps)
-
-    steps, _ = step.remaining(before.unknowns, minimum.evaluation, bounds)
-    wanted = size(steps)
-    if np.isfinite(rule.coefficients):
-        decrement = max(0.5 * float(d @ before.evaluation.matrix @ d) for d in steps)
-        wanted = max(0.0 if np.isinf(rule.step_sd) else wanted, decrement / (rule.coefficients * len(unknowns)))
-    correlated = now.correlated + step.settled
-    if np.isinf(rule.model_error):
-        there = OuterIterate(objective, minimum, Convergence(wanted, 0.0, 0.0), now.checks, now.totals)
-        return replace(there, correlated=correlated), spent
-    checks, missing = now.checks, np.inf
-    if asked:
-        off, rise = set_off(objective, minimum, errors)
-        _, promised = step.reductions(before.unknowns, minimum.evaluation)
-        missing = float(np.max(off / (rule.model_error * tolerance), initial=0.0))
-        missing = max(missing, abs(rise) / (NOISE + BAD * max(promised, 0.0)))
-        checks = sum((approximation.error_counts for approximation in objective.approximations), checks)
-    if max(missing, left) >= 1.0:
+    states_error = asked and left < 1.0
+    if left < 1.0 or not step.settled:
+        evaluation, errors = both(
+            lambda: objective(unknowns), lambda: model_errors(objective, unknowns) if states_error else []
+        )
+        minimum, spent = replace(minimum, evaluation=evaluation), 1
+        if states_error:
+            off, rise = set_off(objective, minimum, errors)
+            _, promised = step.reductions(before.unknowns, evaluation)
+            missing = float(np.max(off / (rule.model_error * rule.tolerance(minimum, n)), initial=0.0))
+            missing = max(missing, abs(rise) / (NOISE + BAD * max(promised, 0.0)))
+            checks = sum((approximation.error_counts for approximation in objective.approximations), checks)
+    exact = max(missing, left) >= 1.0
+    if exact:
         points = objective.linearisation_points(unknowns, minimum.evaluation, all_material=rule.all_material)
         pairs = zip(objective.approximations, points, strict=True)
         objective = objective.under([approximation.update(point) for approximation, point in pairs])
-        minimum, spent = replace(minimum, evaluation=objective(unknowns)), 2
-        steps, across = step.remaining(before.unknowns, minimum.evaluation, bounds)
-        if across:  # by a model that is exact there
-            wanted, left, missing = size(steps), 0.0, 0.0
-    there = OuterIterate(objective, minimum, Convergence(wanted, left, missing), checks, now.totals)
-    return replace(there, correlated=correlated), spent
+        minimum, spent = replace(minimum, evaluation=objective(unknowns)), spent + 1
+    steps, across = step.remaining(before.unknowns, minimum.evaluation, bounds)
+    tolerance = rule.tolerance(minimum, n)
+    wanted = max(float(np.max(np.abs(d[:n]) / tolerance, initial=0.0)) for d in steps)
+    if np.isfinite(rule.coefficients):
+        decrement = max(0.5 * float(d @ before.evaluation.matrix @ d) for d in steps)
+        wanted = max(0.0 if np.isinf(rule.step_sd) else wanted, decrement / (rule.coefficients * len(unknowns)))
+    if exact and across:
+        left = missing = 0.0
+    convergence, correlated = Convergence(wanted, left, missing), now.correlated + step.settled
+    return OuterIterate(objective, minimum, convergence, checks, now.totals, correlated), spent
 
 
 def linearisation_distance(objective: Objective, unknowns: NDArray[np.float64]) -> float:

@@ -13,7 +13,7 @@ from palpate.errors import SolverError
 from palpate.parallel import mapped, processors
 
 WORTH_THREADS = 3_000_000  # products; below, handing them to a thread takes longer than it spares
-PART = 2**20  # bytes of a product that are made at once: the system fills what SciPy takes for more with zeros each time
+PART = 2**20  # bytes of a product made at once: what SciPy takes for more the system fills with zeros each time
 ROOM = 2**29  # bytes of the vectors of columns that are iterated together
 VECTORS = 8  # that a column takes
 FEWEST = 32  # columns together, below which products with a factor are slow
@@ -34,7 +34,7 @@ def times(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -
         own = sparse.csr_matrix((end - begin, matrix.shape[1]))  # which would copy the entries, were it made of them
         own.data, own.indices = matrix.data[entries], matrix.indices[entries]
         own.indptr = matrix.indptr[begin : end + 1] - matrix.indptr[begin]
-        found[begin:end] = own @ together
+        found[begin:end] = np.asarray(own @ together)
 
     share_of = np.linspace(0, matrix.nnz, max(processors(), found.nbytes // PART) + 1)[1:-1]
     ends = [0, *np.searchsorted(matrix.indptr, share_of).tolist(), matrix.shape[0]]
