@@ -27,7 +27,7 @@ from palpate.mechanics.material import HOMOGENEOUS, MaterialForces, MaterialMode
 from palpate.mechanics.newton import NewtonPath, NewtonSettings, follow
 from palpate.mechanics.pattern import BlockPattern, Restriction, Stiffness, block_pattern, restriction
 from palpate.mechanics.solvers.conjugate_gradients import times
-from palpate.mechanics.solvers.contract import AT_ONCE, Factorisation
+from palpate.mechanics.solvers.contract import Factorisation, together
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 from palpate.mesh.space import Constraint, LagrangeSpace
 
@@ -283,8 +283,7 @@ class FiniteStrainEquilibrium:
         first, modes = self.model.n_regions, self.model.constraint.modes
         each, along = np.eye(first + self.model.n_modes), self._parameter_forces(stiffness)
         system, result = self._system(stiffness, len(each)), np.zeros((len(self.values), len(each)))
-        for start in range(0, len(each), AT_ONCE):
-            some = slice(start, start + AT_ONCE)
+        for some in together(len(self.values), len(each)):
             loads = -np.asarray(self.balance.free.T @ along(each[:, some]))
             result[:, some] = np.asarray(self.balance.free @ system.solve(loads, tolerance=tolerance))
         result[:, first : first + modes.shape[1]] += modes

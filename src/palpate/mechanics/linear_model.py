@@ -29,7 +29,7 @@ from palpate.mechanics.material import (
 )
 from palpate.mechanics.rigid import linear_displacements, rigid_modes
 from palpate.mechanics.solvers.conjugate_gradients import times
-from palpate.mechanics.solvers.contract import AT_ONCE, EXACT, Factorisation
+from palpate.mechanics.solvers.contract import EXACT, Factorisation, together
 from palpate.mechanics.solvers.registry import factorise
 from palpate.mechanics.stiffness import (
     lame_parts,
@@ -262,8 +262,7 @@ class LinearSystem:
         along = np.eye(self.model.material.n_modes) if directions is None else directions
         free, by_material = self.model.constraint.free, self.model.by_material(self.moduli, values)
         found: NDArray[Any] = np.zeros((len(values), along.shape[1]), dtype=dtype)
-        for start in range(0, along.shape[1], AT_ONCE):
-            some = slice(start, start + AT_ONCE)
+        for some in together(len(values), along.shape[1]):
             forces = np.asarray(free.T @ by_material.along(along[:, some]))
             found[:, some] = free @ self.factorisation.solve(-forces, tolerance=tolerance)
         return found
@@ -274,12 +273,12 @@ class LinearSystem:
         loads = sparse.csc_matrix(weighted_sum(self.moduli, self.model.coupling))
         found = np.empty((len(constraint.offset), constraint.n_modes + 1), dtype=np.float32)
         found[:, :-1], found[:, -1] = constraint.modes, constraint.offset
-        for start in range(0, loads.shape[1], AT_ONCE):
-            some = loads[:, start : start + AT_ONCE].toarray()
-            if start + AT_ONCE >= loads.shape[1]:
+        for part in together(*loads.shape):
+            some = loads[:, part].toarray()
+            if part.stop == loads.shape[1]:
                 some[:, -1] -= self.model.free_load
             solution = self.factorisation.solve(some, tolerance=tolerance)
-            found[:, start : start + AT_ONCE] -= np.asarray(constraint.free @ solution, dtype=np.float32)
+            found[:, part] -= times(constraint.free, solution)
         return found
 
     def solve(self, coefficients: NDArray[np.float64]) -> LinearEquilibrium:

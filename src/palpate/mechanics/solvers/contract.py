@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-AT_ONCE = 64  # right-hand sides of many: what a solution takes beside its answer is a multiple of that
+ROOM, FEWEST = 2**27, 64  # bytes of right-hand sides that are solved for together, and their number at the least
 EXACT = 1e-10  # relative residual of a solution of which nothing else is asked
+
+
+def together(unknowns: int, number: int) -> list[slice]:
+    """Ranges of many right-hand sides that are solved for together; what that takes beside the answer is their size."""
+    parts = -(-number // max(ROOM // (8 * max(unknowns, 1)), FEWEST))
+    return [slice(*ends) for ends in pairwise(np.linspace(0, number, parts + 1).astype(int).tolist())]
 
 
 class Factorisation(Protocol):
