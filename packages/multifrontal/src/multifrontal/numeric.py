@@ -1,13 +1,14 @@
-"""The factor's numbers, subtrees of fronts side by side, and solutions with them, one front after the other.
+"""The factor's numbers, and solutions with them: fronts one after the other, subtrees of them side by side.
 
 A solution reads the factor from memory once a way, by however many threads, and what surrounds its calls on small
-fronts takes as long as these: threads would wait for Python's lock, and products by NumPy cost least.
+fronts takes as long as these: for few right-hand sides threads would wait for Python's lock, and products by NumPy cost
+least. So subtrees are met by all right-hand sides at once, and the fronts above by each thread with its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -23,7 +24,7 @@ __all__ = ["NotPositiveDefinite", "factorised", "substituted"]
 BLOCK = 256  # columns of a large front that are eliminated before the others hear of them
 Everywhere = Callable[[Callable[[Any], None], Iterable[Any]], None]
 FEW = 3  # right-hand sides up to which one at a time is fastest: the products of several have no kernel for so few
-SHARED = 32  # right-hand sides from which on threads share the large fronts: for fewer it takes as long
+SHARED = 48  # right-hand sides from which on threads share the fronts: for fewer it takes as long
 ROWS = 2048  # of right-hand sides that are put in order while they lie in the cache
 LARGEST_BLOCK = 64  # right-hand sides of a thread; more at once are not faster and take more memory
 
@@ -266,13 +267,19 @@ class _One:
 
 
 def _side_by_side(plan: Plan, factor: Matrix, x: Matrix) -> None:
-    """L^-T L^-1 X in place of X (n, m), rows in the order of elimination; threads share the columns in large fronts.
-
-    Subtrees, of small fronts, by one: several would wait for Python's lock longer than they compute.
-    """
-    subtrees = [front for step in plan.steps for s in step.subtrees for front in plan.fronts[s.start : s.stop]]
+    """L^-T L^-1 X in place of X (n, m), rows in the order of elimination, subtrees side by side."""
+    subtrees = [plan.fronts[subtree.start : subtree.stop] for step in plan.steps for subtree in step.subtrees]
     above = [plan.fronts[s] for step in plan.steps for s in step.then]
     ends = np.linspace(0, x.shape[1], min(plan.threads, x.shape[1]) + 1).astype(int).tolist()
+
+    def up(subtree: tuple[Front, ...]) -> tuple[NDArray[np.int64], Matrix]:
+        """The subtree's own rows in their place; what it changes above (its root's rows), and by how much."""
+        root = subtree[-1]
+        begin, end = subtree[0].first, root.first + root.width
+        alone = np.concatenate([x[begin:end], np.zeros((len(root.rows), x.shape[1]), x.dtype)])
+        _forward([_within(front, begin, end, root.rows) for front in subtree], factor, alone)
+        x[begin:end] = alone[: end - begin]
+        return root.rows, alone[end - begin :]
 
     def over(columns: tuple[int, int]) -> None:
         """The fronts above all subtrees, for some of the right-hand sides."""
@@ -281,10 +288,17 @@ def _side_by_side(plan: Plan, factor: Matrix, x: Matrix) -> None:
         _backward(above, factor, part)
         x[:, slice(*columns)] = part
 
-    _forward(subtrees, factor, x)
     with pool_of(plan.threads) as pool:
+        for rows, change in pool.map(up, subtrees):
+            x[rows] += change
         list(pool.map(over, pairwise(ends)))
-    _backward(subtrees, factor, x)
+        list(pool.map(lambda subtree: _backward(subtree, factor, x), subtrees))
+
+
+def _within(front: Front, begin: int, end: int, rows: NDArray[np.int64]) -> Front:
+    """A front of a subtree with unknowns `begin` to `end`, which come first, before those at `rows` above it."""
+    above = np.searchsorted(rows, front.rows) + end - begin
+    return replace(front, first=front.first - begin, rows=np.where(front.rows < end, front.rows - begin, above))
 
 
 def _forward(fronts: Iterable[Front], factor: Matrix, x: Matrix) -> None:
