@@ -216,7 +216,7 @@ def test_no_changed_number_of_blas_threads_is_left_behind(body):
 
 
 def test_calls_side_by_side_and_nested_share_the_limit_and_restore_the_number_of_blas_threads():
-    before, together, seen = blas_threads(), threading.Barrier(4), list[int]()
+    together, seen = threading.Barrier(4), list[int]()
 
     def work():
         with dense.blas_on_one_thread():
@@ -226,13 +226,37 @@ def test_calls_side_by_side_and_nested_share_the_limit_and_restore_the_number_of
             together.wait(timeout=60.0)
 
     workers = [threading.Thread(target=work) for _ in range(4)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        for worker in workers:
+            worker.start()
+        for worker in workers:
+            worker.join()
+        assert set(blas_threads()) == {2}
     assert len(seen) >= 4
     assert set(seen) == {1}
-    assert blas_threads() == before
+
+
+def test_a_limit_that_one_thread_sets_another_one_lifts_while_the_first_lives():
+    inside, leave, left, end = (threading.Event() for _ in range(4))
+
+    def first():
+        with dense.blas_on_one_thread():
+            inside.set()
+            leave.wait(timeout=60.0)
+        left.set()
+        end.wait(timeout=60.0)
+
+    worker = threading.Thread(target=first)
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        worker.start()
+        inside.wait(timeout=60.0)
+        with dense.blas_on_one_thread():
+            leave.set()
+            left.wait(timeout=60.0)
+            assert set(blas_threads()) == {1}
+        assert set(blas_threads()) == {2}
+    end.set()
+    worker.join()
 
 
 def eliminated(matrix):
@@ -343,6 +367,7 @@ class Libraries:
     """One number of threads for the whole process, as a BLAS has it."""
 
     threads = 2
+    lib_controllers = ()
 
     def limit(self, *, limits, user_api):
         assert user_api == "blas"

@@ -185,6 +185,15 @@ def _libraries() -> threadpoolctl.ThreadpoolController:
     return threadpoolctl.ThreadpoolController()
 
 
+def _in_control() -> threadpoolctl.ThreadpoolController:
+    """The libraries, whose limits this thread may set: from threadpoolctl 3.8 on one alone may, others do nothing."""
+    for library in _libraries().lib_controllers:
+        clear = getattr(library, "clear_controlling_thread", None)
+        if clear is not None:
+            clear(force=True)
+    return _libraries()
+
+
 @contextmanager
 def blas_on_one_thread() -> Iterator[None]:
     """While this lasts BLAS computes each call on one thread; afterwards as before.
@@ -194,7 +203,7 @@ def blas_on_one_thread() -> Iterator[None]:
     """
     with _turn:
         if _callers.number == 0:
-            _callers.limit = _libraries().limit(limits=1, user_api="blas")
+            _callers.limit = _in_control().limit(limits=1, user_api="blas")
         _callers.number += 1
     try:
         yield
@@ -202,6 +211,7 @@ def blas_on_one_thread() -> Iterator[None]:
         with _turn:
             _callers.number -= 1
             if _callers.number == 0 and _callers.limit is not None:
+                _in_control()
                 _callers.limit.__exit__(None, None, None)
                 _callers.limit = None
 
