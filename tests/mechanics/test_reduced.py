@@ -11,7 +11,7 @@ from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics import reduced
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
-from palpate.mechanics.reduced import orthonormal_basis, projection
+from palpate.mechanics.reduced import free_combinations, orthonormal_basis, projection
 from palpate.mesh.space import lagrange_space
 
 RATIOS = (0.2, 1.0, 5.0, 25.0)
@@ -133,6 +133,21 @@ def test_what_is_added_copies_nothing_and_spans_with_what_is_there_by_any_thread
         assert np.allclose(grown.reduced.components(values), whole.T @ values, atol=1e-12)
         some = np.arange(0, len(whole), 3)
         assert np.allclose(grown.reduced.components(values[some], some), whole[some].T @ values[some], atol=1e-12)
+
+
+def test_a_basis_takes_the_place_of_its_snapshots_where_it_may_alone(rng):
+    snapshots = rng.standard_normal((50, 4))
+    before = snapshots.copy()
+    vectors = orthonormal_basis(snapshots)
+    assert np.array_equal(snapshots, before)
+    assert np.array_equal(orthonormal_basis(snapshots, overwrite=True), vectors)
+    assert np.array_equal(snapshots, vectors)
+
+
+def test_combinations_of_free_displacements_are_those_in_double_precision(model, rng):
+    displacements, combinations = rng.standard_normal((model.constraint.free.shape[0], 5)), rng.standard_normal((5, 3))
+    found = free_combinations(model, displacements.astype(np.float32), combinations.astype(np.float32))
+    assert np.allclose(found, model.constraint.free.T @ displacements @ combinations, rtol=0.0, atol=1e-5)
 
 
 def test_what_is_there_already_extends_nothing(model):

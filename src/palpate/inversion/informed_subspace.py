@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse
+from scipy import linalg
 
 from palpate.approximation.reduced_basis import SNAPSHOT, ReducedBasis, basis_of
 from palpate.inversion.hyper_parameters import with_first_noise
@@ -21,11 +21,9 @@ from palpate.inversion.trust_region import OuterIterate, begun, fit_coefficients
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
-from palpate.parallel import mapped
+from palpate.mechanics.reduced import free_combinations
 from palpate.progress import Progress
 from palpate.unknowns.blocks import Acts, Block
-
-ROWS = 1024  # of displacements that are combined at once
 
 
 def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progress: Progress) -> OuterIterate:
@@ -113,15 +111,8 @@ class _Responses:
         """The reduced basis of combinations (n_boundary, k) and (n_material, l), of which `model` is made."""
         own = np.eye(1, int(np.any(self.boundary[:, -1])))  # that of offset and loads, where there are any
         every = linalg.block_diag(boundary, own).astype(np.float32)
-        free = sparse.csr_matrix(model.constraint.free.T).astype(np.float32)
-        snapshots = np.empty((free.shape[0], every.shape[1]))
-
-        def fill(rows: slice) -> None:
-            """Some rows of the free displacements, which are among the largest arrays there are."""
-            snapshots[rows] = np.asarray(free[rows] @ self.boundary) @ every
-
-        mapped(fill, [slice(start, start + ROWS) for start in range(0, len(snapshots), ROWS)])
         cost = self.system.response_counts + SolveCounts(tangent=self.material.shape[1])
+        snapshots = free_combinations(model, self.boundary, every)
         basis = basis_of(replace(self.system, model=model), snapshots, cost)
         responses = np.asarray(self.material @ material.astype(np.float32), dtype=np.float64)
         return basis.with_material(responses, self.system.moduli)

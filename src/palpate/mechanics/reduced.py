@@ -22,7 +22,7 @@ from palpate.parallel import mapped, processors
 
 RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
 WELL_CONDITIONED = 1e-12  # of the Gram matrix' largest eigenvalue: above it Cholesky's factor orthogonalises safely
-ROWS = 2048  # of basis vectors, made orthogonal or multiplied with a stiffness at once, in the cache
+ROWS = 2048  # of basis vectors that are met at once, in the cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,6 +269,21 @@ class Projection:
     def with_material(self, responses: NDArray[np.float64]) -> Projection:
         """The projection with responses du/dc_k (n_dof, n_material) mm to the material modes."""
         return replace(self, reduced=replace(self.reduced, output_material=responses))
+
+
+def free_combinations(
+    model: LinearModel, displacements: NDArray[np.float32], combinations: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """F^T U C (n_free, k) mm of displacements U (n_dof, l) mm in single precision, and C (l, k), dimensionless."""
+    free = sparse.csr_matrix(model.constraint.free.T).astype(np.float32)
+    found = np.empty((free.shape[0], combinations.shape[1]))
+
+    def fill(rows: slice) -> None:
+        """Some rows: as a whole, in single precision and double, it would be there twice."""
+        found[rows] = np.asarray(free[rows] @ displacements) @ combinations
+
+    mapped(fill, [slice(start, start + ROWS) for start in range(0, len(found), ROWS)])
+    return found
 
 
 def projection(model: LinearModel, snapshots: NDArray[np.float64], *, overwrite: bool = False) -> Projection:

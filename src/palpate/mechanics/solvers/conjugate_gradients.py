@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate.errors import SolverError
+from palpate.mechanics.solvers.contract import together
 from palpate.parallel import mapped, processors
 
 WORTH_THREADS = 3_000_000  # products; below, handing them to a thread takes longer than it spares
@@ -25,7 +26,7 @@ def times(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -
     """A X (n, k) for A (n, m) and X (m, k), in the unit of their products."""
     if matrix.nnz * vectors.shape[1] < WORTH_THREADS:
         return np.asarray(matrix @ vectors)
-    together, found = np.ascontiguousarray(vectors), np.empty((matrix.shape[0], vectors.shape[1]))
+    by_rows, found = np.ascontiguousarray(vectors), np.empty((matrix.shape[0], vectors.shape[1]))
 
     def rows(part: tuple[int, int]) -> None:
         """Those of the product from the first to before the last."""
@@ -34,7 +35,7 @@ def times(matrix: sparse.csr_matrix[np.float64], vectors: NDArray[np.float64]) -
         own = sparse.csr_matrix((end - begin, matrix.shape[1]))  # which would copy the entries, were it made of them
         own.data, own.indices = matrix.data[entries], matrix.indices[entries]
         own.indptr = matrix.indptr[begin : end + 1] - matrix.indptr[begin]
-        found[begin:end] = np.asarray(own @ together)
+        found[begin:end] = np.asarray(own @ by_rows)
 
     share_of = np.linspace(0, matrix.nnz, max(processors(), found.nbytes // PART) + 1)[1:-1]
     ends = [0, *np.searchsorted(matrix.indptr, share_of).tolist(), matrix.shape[0]]
@@ -63,15 +64,13 @@ def conjugate_gradients(
     Raises `SolverError` for a direction of no positive energy and when the tolerance is not met.
     """
     tolerances = np.broadcast_to(np.asarray(tolerance, dtype=np.float64), rhs.shape[1:])
-    together = max(ROOM // (VECTORS * 8 * max(len(rhs), 1)), FEWEST)
-    if rhs.shape[1] > together:
-        number_of_parts = -(-rhs.shape[1] // together)
-        parts = zip(
-            np.array_split(rhs, number_of_parts, axis=1), np.array_split(tolerances, number_of_parts), strict=True
-        )
+    parts = together(*rhs.shape, room=ROOM // VECTORS, fewest=FEWEST)
+    if len(parts) > 1:
         found = [
-            conjugate_gradients(product, part, precondition, tolerance=own, max_iterations=max_iterations)
-            for part, own in parts
+            conjugate_gradients(
+                product, rhs[:, part], precondition, tolerance=tolerances[part], max_iterations=max_iterations
+            )
+            for part in parts
         ]
         return np.concatenate([solution for solution, _ in found], axis=1), max(number for _, number in found)
     norms = column_norms(rhs)

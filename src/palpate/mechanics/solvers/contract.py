@@ -15,9 +15,13 @@ ROOM, FEWEST = 2**27, 64  # bytes of right-hand sides that are solved for togeth
 EXACT = 1e-10  # relative residual of a solution of which nothing else is asked
 
 
-def together(unknowns: int, number: int) -> list[slice]:
-    """Ranges of many right-hand sides that are solved for together; what that takes beside the answer is their size."""
-    parts = -(-number // max(ROOM // (8 * max(unknowns, 1)), FEWEST))
+def together(unknowns: int, number: int, *, room: int = ROOM, fewest: int = FEWEST) -> list[slice]:
+    """Ranges, of nearly equal length, of so many right-hand sides that are met together, of numbers of eight bytes.
+
+    They take up to `room` bytes, but for the `fewest` that are worth it; what a solution takes beside its answer is a
+    multiple of that.
+    """
+    parts = -(-number // max(room // (8 * max(unknowns, 1)), fewest))
     return [slice(*ends) for ends in pairwise(np.linspace(0, number, parts + 1).astype(int).tolist())]
 
 
