@@ -25,7 +25,16 @@ from numpy.typing import NDArray
 
 from palpate.approximation import LinearisationPoint, exact_approximation
 from palpate.images import Role
-from palpate.inversion import InverseProblem, Inversion, InversionSettings, Objective, continue_at_finite_strain, invert
+from palpate.inversion import (
+    REPORTED,
+    InverseProblem,
+    Inversion,
+    InversionSettings,
+    Objective,
+    concluded,
+    continued,
+    invert,
+)
 from palpate.mesh import LagrangeSpace, triangle_normals
 from palpate.observation import NoiseModel, fit_noise_model, observed_surface
 from palpate.phantoms import Noise, Scene
@@ -131,8 +140,8 @@ def _from_far_off(finite: Inversion, linear: Inversion, settings: InversionSetti
         objective=replace(linear.objective, states=states),
         minimum=replace(linear.minimum, unknowns=unknowns),
     )
-    moved = replace(linear, candidates=(replace(best, iterate=iterate),), best=0, starts=())
-    return continue_at_finite_strain(moved, settings.bounds, progress=_silent)
+    ends = continued((iterate,), settings.bounds, rule=REPORTED, progress=_silent)
+    return concluded(ends, (), linear.rest, settings.bounds)
 
 
 def _errors(inversion: Inversion, scene: Scene) -> Result:

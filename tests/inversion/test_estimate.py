@@ -10,17 +10,18 @@ import pytest
 
 from palpate.inversion import (
     Bounds,
+    Candidate,
     InversionSettings,
     Objective,
     Outcome,
     StartRun,
     begun,
-    candidates,
+    concluded,
     invert,
     minimised,
     posterior_sd,
 )
-from palpate.inversion.candidates import compared, concluded
+from palpate.inversion import starts as of_starts
 from palpate.inversion.trust_region import NEAR
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
@@ -190,7 +191,8 @@ def worse(twins, twin, iterate):
 def together(twins, *iterates):
     starts = tuple(StartRun(np.zeros(2), it.minimum, i) for i, it in enumerate(iterates))
     bounds = twins.settings(1.0).bounds
-    return concluded(iterates, starts, iterates[0].minimum.evaluation, bounds, 0)
+    ends = [Candidate(iterate, iterate.objective.total(iterate.minimum.evaluation)) for iterate in iterates]
+    return concluded(ends, starts, iterates[0].minimum.evaluation, bounds)
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -202,13 +204,15 @@ def test_the_worse_fit_does_not_win_because_its_noise_is_larger(twins, iterate, 
 
 
 def test_minima_are_compared_with_the_same_numbers_of_residuals(twins, iterate, worse):
-    """More of them make every value another one: two that differ in that alone are equal."""
+    """More of them make every value another one: by those of the other minimum it is the same as without."""
     noise = NoiseModel(np.array([0.2**2]), np.array([1.0]))
     seen = [o.with_correlation(noise) for o in iterate.objective.observations]
     other = replace(iterate, objective=iterate.objective.with_observations(seen))
-    values, _ = compared([iterate, other, worse], twins.settings(1.0).bounds)
+    fewest, some, most = (it.objective.n_independent for it in (worse, iterate, other))
+    assert 1.2 * fewest < some < most / 1.2
+    values = [[c.value for c in together(twins, one, worse).candidates] for one in (iterate, other)]
     assert values[1] == pytest.approx(values[0], abs=0.02)
-    assert values[2] > values[0] + 2.0
+    assert values[0][1] > values[0][0] + 2.0
 
 
 @pytest.mark.parametrize("ratios", [(1.0,), (0.3, 2.0, 8.0)])
@@ -265,7 +269,7 @@ def test_starts_that_lead_elsewhere_are_followed_the_best_first_and_others_say_t
     twins, voxels, monkeypatch
 ):
     """Four minima of the cheapest model, told to lie apart: the first one's, two that are followed, one that is not."""
-    screened = candidates.cheapest_minima
+    screened = of_starts.cheapest_minima
 
     def apart(*of):
         here, *_ = screened(*of)
@@ -273,14 +277,14 @@ def test_starts_that_lead_elsewhere_are_followed_the_best_first_and_others_say_t
         values = [replace(here.evaluation, value=here.evaluation.value + k) for k in (0.0, 2.0, 1.0, 3.0)]
         return [replace(here, unknowns=here.unknowns + w, evaluation=v) for w, v in zip(ways, values, strict=True)]
 
-    followed, follow = [], candidates.minimised
+    followed, follow = [], of_starts.minimised
 
     def noted(start, *of, **named):
         followed.append((named["title"], start.minimum.unknowns[:2]))
         return follow(start, *of, **named)
 
-    monkeypatch.setattr(candidates, "cheapest_minima", apart)
-    monkeypatch.setattr(candidates, "minimised", noted)
+    monkeypatch.setattr(of_starts, "cheapest_minima", apart)
+    monkeypatch.setattr(of_starts, "minimised", noted)
     found = invert(voxels, twins.settings(0.5, 1.0, 2.0, 4.0), progress=twins.silent)
     assert [title for title, _ in followed if title.startswith("start")] == ["start 3", "start 2"]
     assert [start.candidate for start in found.starts] == [0, 0, 0, None]

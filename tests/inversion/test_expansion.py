@@ -10,11 +10,11 @@ import pytest
 
 from palpate.approximation import expansion
 from palpate.errors import EstimationError, NotConverged, SolverError
-from palpate.inversion import Outcome, continuation, continue_at_finite_strain, invert
-from palpate.inversion.candidates import Candidate
-from palpate.inversion.trust_region import NEAR
+from palpate.inversion import Candidate, Outcome, concluded, continuation, invert
+from palpate.inversion.trust_region import NEAR, REPORTED
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
 from palpate.mechanics.laws.registry import law_named
+from palpate.progress import silent
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +45,13 @@ def linear(twins, body, settings):
     return replace(found, candidates=tuple(candidates))
 
 
+def followed(linear, bounds, progress=silent):
+    """What comes of linear minima."""
+    minima = [candidate.iterate for candidate in linear.candidates]
+    ends = continuation.continued(minima, bounds, rule=REPORTED, progress=progress)
+    return concluded(ends, linear.starts, linear.rest, bounds)
+
+
 def under(model, iterate):
     """A linear minimum whose state has that finite-strain model."""
     states = tuple(replace(state, finite_strain=model) for state in iterate.objective.states)
@@ -64,7 +71,7 @@ def failing(model, error):
 
 
 @pytest.fixture(scope="module")
-def ended(twins, linear, settings):
+def ended(linear, settings):
     """The estimate where all derivatives are made those of each equilibrium up to so many of them."""
 
     @cache
@@ -72,7 +79,7 @@ def ended(twins, linear, settings):
         with pytest.MonkeyPatch.context() as patch:
             around = continuation.expansion_around
             patch.setattr(continuation, "expansion_around", lambda *of, **named: replace(around(*of, **named), few=few))
-            return continue_at_finite_strain(linear, settings.bounds, progress=twins.silent)
+            return followed(linear, settings.bounds)
 
     return with_few
 
@@ -147,11 +154,11 @@ def test_what_both_laws_cost_is_counted(linear, continued):
     assert continued.evaluations > linear.evaluations
 
 
-def test_a_motion_without_equilibrium_ends_the_estimate_where_it_is_the_best_one(twins, body, linear, settings):
+def test_a_motion_without_equilibrium_ends_the_estimate_where_it_is_the_best_one(body, linear, settings):
     best = linear.candidates[linear.best]
     lost = replace(best, iterate=under(failing(body[2], NotConverged("folded")), best.iterate))
     with pytest.raises(NotConverged, match="folded"):
-        continue_at_finite_strain(replace(linear, candidates=(lost,)), settings.bounds, progress=twins.silent)
+        followed(replace(linear, candidates=(lost,)), settings.bounds)
 
 
 FAILURES = {
@@ -173,7 +180,7 @@ def test_secondary_minima_that_fail_do_not_end_a_good_estimate(twins, body, line
     starts = (linear.starts[0], *(replace(linear.starts[1], candidate=k) for k in (1, 2, 3)))
     said = list[str]()
     several = replace(linear, candidates=(first, *others), starts=starts)
-    found = continue_at_finite_strain(several, settings.bounds, progress=said.append)
+    found = followed(several, settings.bounds, progress=said.append)
     assert all(any(str(failure) in line for line in said) for failure in FAILURES)
     assert found.minimum.converged
     assert np.abs(found.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
@@ -188,7 +195,7 @@ def test_starts_that_merge_under_the_law_of_the_case_are_one_candidate(twins, li
     elsewhere = replace(first.iterate, minimum=replace(first.minimum, unknowns=away))
     starts = (linear.starts[0], replace(linear.starts[1], candidate=1))
     both = replace(linear, candidates=(first, Candidate(elsewhere, first.value + 1.0)), starts=starts)
-    found = continue_at_finite_strain(both, settings.bounds, progress=twins.silent)
+    found = followed(both, settings.bounds)
     assert len(found.candidates) == 1
     assert [start.candidate for start in found.starts] == [0, 0]
     assert np.abs(found.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3

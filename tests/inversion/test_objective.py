@@ -186,6 +186,20 @@ def test_derivatives_are_exact_along_what_decides_with_held_blocks_free_too(twin
     assert after < 0.01 * before
 
 
+def test_j_holds_how_seldom_what_is_released_differs(twins, twin):
+    """Where layers are free J has their log prior odds, else not."""
+    held, unknowns = with_a_held_tissue(twins, twin, sd=0.4)
+
+    def total(objective, evaluation, odds):
+        blocks = [replace(b, released_odds=odds * bool(b.released_odds)) for b in objective.parameters.blocks]
+        parameters = replace(objective.parameters, blocks=tuple(blocks))
+        return replace(objective, parameters=parameters).total(evaluation)
+
+    free = held.released(held(unknowns), unknowns)
+    assert total(*free, -3.0) - total(*free, 0.0) == pytest.approx(3.0)
+    assert total(held, held(unknowns), -3.0) == total(held, held(unknowns), 0.0)
+
+
 def test_a_known_tissue_released_as_a_whole_is_a_prior_of_the_scale(twins, twin):
     """Moduli scaled together leave u unchanged: ln E of all organs then varies by as much as that of the tissue."""
     sd = 0.4

@@ -1,9 +1,9 @@
 """The inverse problem: from later states and what is observed of them to the moduli that explain them."""
 
 from palpate.inversion.candidates import Inversion as Inversion
-from palpate.inversion.candidates import StartRun as StartRun
-from palpate.inversion.candidates import as_good as as_good
-from palpate.inversion.continuation import continue_at_finite_strain as continue_at_finite_strain
+from palpate.inversion.candidates import concluded as concluded
+from palpate.inversion.continuation import Candidate as Candidate
+from palpate.inversion.continuation import continued as continued
 from palpate.inversion.estimate import InversionSettings as InversionSettings
 from palpate.inversion.estimate import first_noise_of as first_noise_of
 from palpate.inversion.estimate import invert as invert
@@ -20,6 +20,7 @@ from palpate.inversion.objective import Evaluation as Evaluation
 from palpate.inversion.objective import Linearisation as Linearisation
 from palpate.inversion.objective import LinearisedObjective as LinearisedObjective
 from palpate.inversion.objective import Objective as Objective
+from palpate.inversion.objective import as_good as as_good
 from palpate.inversion.optimise import Bounds as Bounds
 from palpate.inversion.optimise import Iterate as Iterate
 from palpate.inversion.optimise import LeastSquares as LeastSquares
@@ -27,6 +28,8 @@ from palpate.inversion.optimise import Minimum as Minimum
 from palpate.inversion.optimise import Outcome as Outcome
 from palpate.inversion.optimise import gauss_newton as gauss_newton
 from palpate.inversion.optimise import posterior_sd as posterior_sd
+from palpate.inversion.starts import StartRun as StartRun
+from palpate.inversion.trust_region import REPORTED as REPORTED
 from palpate.inversion.trust_region import OuterIterate as OuterIterate
 from palpate.inversion.trust_region import StopRule as StopRule
 from palpate.inversion.trust_region import begun as begun

@@ -1,23 +1,22 @@
-"""From an estimate to its end under a finite-strain law, and with those blocks free that were fixed."""
+"""From minima near which starts lead to their ends: under the law of the case, and with blocks free that were fixed."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from palpate.approximation.expansion import coarse_equilibrium, expansion_around
 from palpate.errors import EstimationError, NotConverged
-from palpate.inversion.candidates import Inversion, concluded
-from palpate.inversion.frozen_posterior import predicted_minimum
 from palpate.inversion.later_state import LaterState
 from palpate.inversion.objective import AS_GOOD, Objective
-from palpate.inversion.optimise import Bounds, Outcome
+from palpate.inversion.optimise import Bounds, Minimum, Outcome
 from palpate.inversion.trust_region import (
     NEAR,
-    REPORTED,
     OuterIterate,
     StopRule,
     begun,
     minimised,
+    predicted,
     total_counted_as,
 )
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
@@ -27,77 +26,100 @@ RELEASED = replace(NEAR, all_material=False)  # whether images tell of what was 
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
 
 
-def continue_at_finite_strain(
-    linear: Inversion, bounds: Bounds, *, progress: Progress, rule: StopRule = REPORTED
-) -> Inversion:
-    """The estimate under the law of the states' `finite_strain` models, from the candidates of the `linear` one.
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A minimum as it ended; `value`: J there, of several by the same numbers of independent residuals.
 
-    The best one is continued always, the others where they are minima; of these one without equilibrium, or that
-    cannot be followed for another reason, is left out of the comparison. rule: when each ends. Raises `NotConverged`
-    when the best one's equilibrium is not found, with the element and the share of the motion where it ended.
+    released: the same followed on with those blocks free that are fixed while it is sought (see `Block.released`); None
+    where there are none, or where it has them free itself. unsettled: why that did not end, "" where it did.
     """
-    ends, spent, evaluations = dict[int, OuterIterate](), linear.counts, linear.evaluations
-    for number, candidate in sorted(enumerate(linear.candidates), key=lambda pair: pair[0] != linear.best):
-        minimum = candidate.minimum
-        if number != linear.best and not minimum.converged:
-            ends[number] = candidate.iterate
+
+    iterate: OuterIterate
+    value: float
+    released: OuterIterate | None = None
+    unsettled: str = ""
+
+    @property
+    def minimum(self) -> Minimum:
+        """The minimum under its own objective."""
+        return self.iterate.minimum
+
+    @property
+    def last(self) -> OuterIterate:
+        """What was followed last, with the history, evaluations and counts of all."""
+        return self.released or self.iterate
+
+
+def continued(
+    minima: Sequence[OuterIterate], bounds: Bounds, *, rule: StopRule, progress: Progress
+) -> tuple[Candidate, ...]:
+    """Linear minima, the best one foremost, followed until they end (see `ended`).
+
+    The best one is followed always. Others that converged are where they are as good, or the law is another one; one
+    that cannot be followed says so in its outcome. rule: when each ends. Raises what ends the best one: `NotConverged`
+    where its equilibrium is not found, with the element and the share of the motion where it ended.
+    """
+    ends, finite = list[Candidate](), minima[0].objective.states[0].finite_strain is not None
+    for near in minima:
+        ends.append(Candidate(near, near.objective.total(near.minimum.evaluation)))
+        if len(ends) > 1 and not (near.minimum.converged and (finite or ends[-1].value - ends[0].value < AS_GOOD)):
             continue
         try:
-            progress("finite strain: the equilibrium at the linear estimate")
-            objective, coarse = _coarse(candidate.iterate)
-            first = [expansion_around(each, tolerance=EQUILIBRIUM, progress=progress) for each in coarse]
-            start = [begun(objective.under(first), minimum.unknowns, history=minimum.history)]
-            del coarse, first  # no longer needed where the loop goes on, and large
-            end = minimised(start.pop(), bounds, rule, progress=progress, title="finite strain")
-            progress("finite strain: the exact equilibrium at the estimate")
-            ends[number] = end = end.at_equilibrium()
-            spent, evaluations = spent + end.counts, evaluations + end.minimum.evaluations
+            ends[-1] = ended(near, bounds, rule=rule, progress=progress)
         except EstimationError as error:
-            if number == linear.best:
+            if len(ends) == 1:
                 raise
-            progress(f"finite strain: another minimum is left out: {error}")
+            progress(f"another minimum is left out: {error}")
             outcome = Outcome.NO_EQUILIBRIUM if isinstance(error, NotConverged) else Outcome.NOT_FOLLOWED
-            ends[number] = replace(ends[linear.best], minimum=replace(minimum, outcome=outcome))
-    ended = [ends[number] for number in sorted(ends)]
-    found = concluded(ended, linear.starts, linear.rest, bounds, linear.best)
-    return replace(found, evaluations=found.evaluations + evaluations, counts=spent)
+            ends[-1] = replace(ends[-1], iterate=replace(near, minimum=replace(near.minimum, outcome=outcome)))
+    return tuple(ends)
 
 
-def with_released(inversion: Inversion, bounds: Bounds, *, progress: Progress, rule: StopRule) -> Inversion:
-    """The inversion with its best minimum followed on with those blocks free that were fixed (see `Block.released`).
+def ended(near: OuterIterate, bounds: Bounds, *, rule: StopRule, progress: Progress) -> Candidate:
+    """A linear minimum followed until it ends by the `rule`, under the law of its states and with those blocks free.
 
-    Where J, with their prior odds and the same numbers of independent residuals, is then less by more than what is as
-    good, the images tell of what was fixed, and this is the estimate, followed until it ends by the `rule`. Where it
-    does not end the inversion says why. Nothing changes where there is no such block, or no minimum to follow.
+    First with the blocks fixed that are while an estimate is sought (see `Block.released`), then with them free. Where
+    J, by the same numbers of independent residuals, is then less by more than what is as good, the images tell of what
+    was fixed, and this is the candidate. Where it does not end the candidate says why. Raises as `continued` does.
     """
-    best = inversion.candidates[inversion.best]
-    before, released = best.iterate, [block for block in inversion.objective.parameters.blocks if block.released]
-    if not before.minimum.converged or not released:
-        return inversion
-    title = f"with {' and '.join(dict.fromkeys(block.cause for block in released))} free"
-    free, end, gain, unsettled = None, before, 0.0, ""
+    finite = near.objective.states[0].finite_strain is not None
+    if finite:
+        before = at_finite_strain(near, bounds, rule=rule, progress=progress)
+    else:
+        before = minimised(near, bounds, rule, progress=progress, title="linear law")
+    fixed, free = Candidate(before, before.objective.total(before.minimum.evaluation)), None
+    causes = dict.fromkeys(block.cause for block in before.objective.parameters.blocks if block.released)
+    if not before.minimum.converged or not causes:
+        return fixed
     try:
-        objective = replace(before.objective, parameters=before.objective.parameters.released())
-        begin = predicted_minimum(objective, before.minimum.unknowns, bounds)
-        start = replace(begun(objective, begin, history=before.minimum.history), checks=before.checks)
-        end = free = minimised(start, bounds, RELEASED, progress=progress, title=title)
-        gain = before.objective.total(before.minimum.evaluation) - total_counted_as(free, before)
-        gain += min(block.released_odds for block in released)
-        if free.minimum.converged and gain > AS_GOOD:
+        title = f"with {' and '.join(causes)} free"
+        end = free = minimised(predicted(before, bounds), bounds, RELEASED, progress=progress, title=title)
+        told = free.minimum.converged and fixed.value - total_counted_as(free, before) > AS_GOOD
+        if told:
             end = minimised(free, bounds, rule, progress=progress, title=title)
-            end = end.at_equilibrium() if inversion.objective.states[0].finite_strain else end
-        unsettled = "" if end.minimum.converged else end.minimum.outcome.value
+            end = end.at_equilibrium() if finite else end
     except EstimationError as error:
-        unsettled = str(error)
-    if free is None:
-        return replace(inversion, unsettled=unsettled)
-    evaluations, counts = inversion.evaluations + end.minimum.evaluations, inversion.counts + end.counts - before.counts
-    found = replace(inversion, evaluations=evaluations, counts=counts, released=free, unsettled=unsettled)
-    if unsettled or end is free:
-        return found
-    candidates = list(inversion.candidates)
-    candidates[inversion.best] = replace(best, iterate=end, value=best.value - gain)
-    return replace(found, candidates=tuple(candidates), released=None)
+        return replace(fixed, released=free, unsettled=str(error))
+    if not end.minimum.converged:
+        return replace(fixed, released=free, unsettled=end.minimum.outcome.value)
+    return Candidate(end, end.objective.total(end.minimum.evaluation)) if told else replace(fixed, released=free)
+
+
+def at_finite_strain(near: OuterIterate, bounds: Bounds, *, rule: StopRule, progress: Progress) -> OuterIterate:
+    """A linear minimum followed until it ends under the law of its states' `finite_strain` models, at an equilibrium.
+
+    History, evaluations and counts are added to those of `near`. Raises as `continued` does.
+    """
+    progress("finite strain: the equilibrium at the linear estimate")
+    objective, coarse = _coarse(near)
+    first = [expansion_around(each, tolerance=EQUILIBRIUM, progress=progress) for each in coarse]
+    at = near.minimum
+    begin = begun(objective.under(first), at.unknowns, history=at.history, evaluations=at.evaluations)
+    start = [replace(begin, checks=near.counts)]
+    del coarse, first, begin, objective  # no longer needed where the loop goes on, and large
+    end = minimised(start.pop(), bounds, rule, progress=progress, title="finite strain")
+    progress("finite strain: the exact equilibrium at the estimate")
+    return end.at_equilibrium()
 
 
 def _coarse(linear: OuterIterate) -> tuple[Objective, list[FiniteStrainEquilibrium]]:

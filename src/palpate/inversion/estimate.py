@@ -1,4 +1,4 @@
-"""From models and observations to the moduli that explain the later images: starts, linear law, finite strain."""
+"""From models and observations to the moduli that explain the later images: start, starts, continuation, comparison."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
-from palpate.inversion.candidates import Inversion, from_starts
-from palpate.inversion.continuation import continue_at_finite_strain, with_released
-from palpate.inversion.informed_subspace import informed_start
+from palpate.inversion.candidates import Inversion, concluded
+from palpate.inversion.continuation import continued
 from palpate.inversion.later_state import InverseProblem
 from palpate.inversion.objective import Objective
 from palpate.inversion.optimise import Bounds, Minimum
+from palpate.inversion.starts import from_starts, informed_start
 from palpate.inversion.trust_region import NEAR, REPORTED, StopRule, minimised
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, during
@@ -50,7 +50,7 @@ def invert(
 
     States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle of the
     bounds and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows
-    ends near. At last blocks that were fixed are released, see `with_released`.
+    ends near. At last blocks that were fixed are free, see `with_released`.
     Raises `ConfigurationError` for an unknown Poisson's ratio with another law, `EstimationError`s of solving; an
     estimate that did not converge says so in its minimum's outcome.
     """
@@ -59,13 +59,11 @@ def invert(
             "a Poisson's ratio can be sought under the linear law only: the finite-strain models hold those of the"
             " tissues; seek none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
         )
-    starts, bounds, ends = settings.every_start, settings.bounds, None if problem.finite_strain else rule
-    start = informed_start(problem, settings.centre, progress=progress)
-    found = from_starts(start, starts, bounds, rule=ends, progress=progress)
-    if problem.finite_strain:
-        progress = during("finite strain", progress)
-        found = continue_at_finite_strain(found, bounds, progress=progress, rule=rule)
-    return with_released(found, bounds, progress=progress, rule=rule)
+    bounds = settings.bounds
+    minima, runs, rest = from_starts(problem, settings.centre, settings.every_start, bounds, progress=progress)
+    progress = during("finite strain", progress) if problem.finite_strain else progress
+    ends = continued(minima, bounds, rule=rule, progress=progress)
+    return concluded(ends, runs, rest, bounds)
 
 
 @blas_on_one_thread()

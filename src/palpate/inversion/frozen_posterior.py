@@ -249,13 +249,3 @@ def cheapest_minima(
     except ConfigurationError:
         cheapest = fixed_correspondence(objective, unknowns, evaluation)
     return mapped(lambda begin: gauss_newton(cheapest, begin, bounds=bounds, tolerance=AS_GOOD / 200.0), begins)
-
-
-def predicted_minimum(objective: Objective, unknowns: NDArray[np.float64], bounds: Bounds) -> NDArray[np.float64]:
-    """Unknowns (n_unknowns,) of the minimum on the cheapest model, or on the way there as far as models are trusted."""
-    (found,) = cheapest_minima(objective, unknowns, objective(unknowns), [unknowns], bounds)
-    away = found.unknowns - unknowns if found.converged else np.zeros(len(unknowns))
-    moduli = np.append(np.arange(objective.n_parameters), objective.parameters.acting_on_moduli)
-    furthest = float(np.max(np.abs(away[moduli]), initial=0.0))
-    trusted = min(approximation.trust_radius for approximation in objective.approximations)
-    return np.asarray(unknowns + min(1.0, trusted / max(furthest, 1e-9)) * away)

@@ -22,6 +22,15 @@ DRIVER_LN_SD = float(np.log(2.0))  # of a driver's scale over that of its kind: 
 AS_GOOD = 1.92  # of minus the log posterior: half the 95 % quantile of chi-squared with one degree of freedom
 
 
+def as_good(value: float, best: float, *, scale: float = 1.0) -> bool:
+    """Whether a minimum of a `value` of minus the log posterior is as likely as one of `best`, as far as data can say.
+
+    By the rule of a 95 % interval: twice their difference, times a `scale` of the deviance (see `Profile`), is below
+    1.96^2. A difference does not depend on how many residuals make it up.
+    """
+    return scale * (value - best) < AS_GOOD
+
+
 @dataclass(frozen=True, slots=True)
 class Linearisation:
     """One observation of one `state` at some unknowns: its residuals, robust weights (n,) and derivatives.
@@ -135,6 +144,7 @@ class Objective:
         """J, dimensionless, where it was evaluated: with ln Z of the residuals, ln det P, ln p(h), ln det H."""
         pairs = zip(self.parameters.blocks, self.chosen, strict=False)
         odds = [block.odds[c] for block, c in pairs if block.odds and c is not None]
+        odds += [min((block.released_odds for block in self.parameters.blocks if not block.released), default=0.0)]
         residuals = sum(o.weighting.log_normaliser for o in self.observations)
         for state in self.states:
             kinds = {o.kind: o.weighting.sd for o in state.observations if not o.of_driver}

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from palpate.approximation.contract import Approximation, ModelError
 from palpate.approximation.expansion import Expansion
 from palpate.errors import NotConverged
+from palpate.inversion.frozen_posterior import cheapest_minima
 from palpate.inversion.hyper_parameters import with_correlations, with_hyper_parameters
 from palpate.inversion.objective import AS_GOOD, Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import (
@@ -147,6 +148,22 @@ def begun(
     evaluation = objective(unknowns)
     history = (*history, Iterate.of(unknowns, evaluation, objective.n_parameters))
     return OuterIterate(objective, Minimum(unknowns, evaluation, Outcome.STEPS, history, evaluations + 1))
+
+
+def predicted(before: OuterIterate, bounds: Bounds) -> OuterIterate:
+    """Where a loop begins after `before` with those blocks free that were fixed (see `Block.released`).
+
+    At the minimum on the cheapest model, or on the way there as far as models are trusted.
+    """
+    at = before.minimum
+    objective, evaluation = before.objective.released(at.evaluation, at.unknowns)
+    (found,) = cheapest_minima(objective, at.unknowns, evaluation, [at.unknowns], bounds)
+    away = found.unknowns - at.unknowns if found.converged else np.zeros(len(at.unknowns))
+    moduli = np.append(np.arange(objective.n_parameters), objective.parameters.acting_on_moduli)
+    furthest = float(np.max(np.abs(away[moduli]), initial=0.0))
+    trusted = min(approximation.trust_radius for approximation in objective.approximations)
+    unknowns = at.unknowns + min(1.0, trusted / max(furthest, 1e-9)) * away
+    return replace(begun(objective, unknowns, history=at.history, evaluations=at.evaluations), checks=before.checks)
 
 
 @dataclass(frozen=True, slots=True)

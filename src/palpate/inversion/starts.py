@@ -1,12 +1,14 @@
-"""Of all unknowns beside the moduli those combinations that the images tell: a likelihood-informed subspace.
+"""Where an estimate begins: in what the images tell of all unknowns, and near the minima to which all starts lead.
 
-Most modes of a frame, or of a tissue's ln E, move no observed surface by as much as its noise: the images leave them
-what they were believed to be, and so no modulus is paid for them. To carry them through every step costs most of an
+Of all unknowns beside the moduli those combinations stay that the images tell: a likelihood-informed subspace. Most
+modes of a frame, or of a tissue's ln E, move no observed surface by as much as its noise: the images leave them what
+they were believed to be, and so no modulus is paid for them. To carry them through every step costs most of an
 estimate's time and memory.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,16 +16,73 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.approximation.reduced_basis import SNAPSHOT, ReducedBasis, basis_of
+from palpate.inversion.frozen_posterior import cheapest_minima
 from palpate.inversion.hyper_parameters import with_first_noise
 from palpate.inversion.later_state import InverseProblem, LaterState
-from palpate.inversion.objective import Objective
-from palpate.inversion.trust_region import OuterIterate, begun, fit_coefficients
+from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.optimise import Bounds, Minimum, grouped, same_minimum
+from palpate.inversion.trust_region import NEAR, OuterIterate, begun, fit_coefficients, minimised
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.mechanics.reduced import free_combinations
 from palpate.progress import Progress
 from palpate.unknowns.blocks import Acts, Block
+
+COMPARED = replace(NEAR, correlate=False)  # the numbers of independent residuals stay: objectives are compared
+FOLLOWED = 2  # minima of starts beside the first one, the best
+
+
+@dataclass(frozen=True, slots=True)
+class StartRun:
+    """What one start did on the cheapest model: log-moduli (n_parameters,) where it began, and the minimum it found.
+
+    candidate: number of the minimum that it leads to, None where that was not followed, others being lower.
+    """
+
+    theta: NDArray[np.float64]
+    minimum: Minimum
+    candidate: int | None
+
+
+def from_starts(
+    problem: InverseProblem,
+    centre: NDArray[np.float64],
+    starts: Sequence[NDArray[np.float64]],
+    bounds: Bounds,
+    *,
+    progress: Progress,
+) -> tuple[tuple[OuterIterate, ...], tuple[StartRun, ...], Evaluation]:
+    """The distinct minima near which all starts lead, the best one foremost; what each did; J at no motion.
+
+    centre: theta (n_parameters,) where the first minimum is sought; starts: theta (n_parameters,) each, followed on the
+    cheapest model with the closest points of that one. The best are followed further. Raises as `invert` does.
+    """
+    start, n = informed_start(problem, centre, progress=progress), problem.parameters.n_parameters
+    nothing = np.zeros(len(start.minimum.unknowns))
+    rest = start.objective.rematched(nothing)(nothing)
+    first = minimised(start, bounds, NEAR, progress=progress, title="the first minimum")
+    progress(f"{len(starts)} starts, with the closest points of the first minimum")
+    at, made, ends = first.minimum, replace(first, checks=SolveCounts()).counts, [first]
+    begins = [np.concatenate([theta, at.unknowns[n:]]) for theta in starts]
+    screened = cheapest_minima(first.objective, at.unknowns, at.evaluation, begins, bounds)
+    groups = grouped(screened, n)
+    belongs, followed = {groups[i]: 0 for i, m in enumerate(screened) if same_minimum(m.unknowns, at, n)}, 0
+    for number in sorted(range(len(screened)), key=lambda i: screened[i].evaluation.value):
+        if followed == FOLLOWED or groups[number] in belongs or not screened[number].converged:
+            continue
+        begin = replace(begun(first.objective, screened[number].unknowns), checks=SolveCounts() - made)  # its own cost
+        end = minimised(begin, bounds, COMPARED, progress=progress, title=f"start {number + 1}")
+        met = next((i for i, near in enumerate(ends) if same_minimum(end.minimum.unknowns, near.minimum, n)), len(ends))
+        if met < len(ends):
+            near, spent = ends[met], ends[met].minimum.evaluations + end.minimum.evaluations
+            end = replace(near, minimum=replace(near.minimum, evaluations=spent), checks=near.checks + end.counts)
+        ends[met:], belongs[groups[number]], followed = [end, *ends[met + 1 :]], met, followed + 1
+    values = [(not end.minimum.converged, end.objective.total(end.minimum.evaluation)) for end in ends]
+    order = sorted(range(len(ends)), key=lambda i: values[i])
+    candidates = [belongs.get(group) for group in groups]
+    runs = zip(starts, screened, (None if c is None else order.index(c) for c in candidates), strict=True)
+    return tuple(ends[i] for i in order), tuple(StartRun(*run) for run in runs), rest
 
 
 def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progress: Progress) -> OuterIterate:

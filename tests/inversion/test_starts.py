@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.inversion import LaterState, invert, posterior_sd
-from palpate.inversion import informed_subspace as informed
+from palpate.inversion import starts as informed
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.material import material_modes
 from palpate.uncertainty.alternatives import undecided_covariance
