@@ -94,15 +94,15 @@ def ended(near: OuterIterate, bounds: Bounds, *, rule: StopRule, progress: Progr
     try:
         title = f"with {' and '.join(causes)} free"
         end = free = minimised(predicted(before, bounds), bounds, RELEASED, progress=progress, title=title)
-        told = free.minimum.converged and fixed.value - total_counted_as(free, before) > AS_GOOD
-        if told:
+        likelier = free.minimum.converged and fixed.value - total_counted_as(free, before) > AS_GOOD
+        if likelier:
             end = minimised(free, bounds, rule, progress=progress, title=title)
             end = end.at_equilibrium() if finite else end
     except EstimationError as error:
         return replace(fixed, released=free, unsettled=str(error))
     if not end.minimum.converged:
         return replace(fixed, released=free, unsettled=end.minimum.outcome.value)
-    return Candidate(end, end.objective.total(end.minimum.evaluation)) if told else replace(fixed, released=free)
+    return Candidate(end, end.objective.total(end.minimum.evaluation)) if likelier else replace(fixed, released=free)
 
 
 def at_finite_strain(near: OuterIterate, bounds: Bounds, *, rule: StopRule, progress: Progress) -> OuterIterate:
