@@ -240,7 +240,7 @@ def cheapest_minima(
     begins: Sequence[NDArray[np.float64]],
     bounds: Bounds,
 ) -> list[Minimum]:
-    """The minimum from each of several `begins` (n,), closest points and hyper-parameters as at an evaluation at `unknowns`.
+    """The minimum from each of the `begins` (n,), closest points and hyper-parameters those of an evaluation.
 
     Of the frozen posterior; where the objective's models are no reduced ones, of what only has the former.
     """
