@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigurationError, NotConverged
+from palpate.mechanics.balance import TissueBalance
 from palpate.mechanics.boundary import Conditions, outer_constraint
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import finite_strain_model
@@ -100,6 +101,38 @@ def test_the_linear_model_lends_start_and_factorisation(model):
     found = model.solve(MODULI, q, start=linear.displacement, nearby=system.factorisation)
     assert found.counts.factorisations == 0
     assert np.allclose(found.values, model.solve(MODULI, q).values, atol=1e-6)
+
+
+def test_stiffnesses_of_both_laws_have_one_pattern(meshes):
+    """The solver's plan is of the pattern. Cubes have entries that are zero under the linear law alone."""
+    mesh = meshes.box_mesh(3, size=30.0, tissues=[meshes.known("fat", nu=0.45), meshes.unknown("organ", nu=0.4)])
+    space = lagrange_space(mesh, "P2")
+    constraint = outer_constraint(space, outer="fixed", **meshes.prescribe(space, np.zeros(0, int), np.zeros((0, 3))))
+    system = linear_model(space, constraint, dilatation=Dilatation.BLENDED).system(MODULI)
+    model = finite_strain_model(space, constraint, LAWS["neo-hookean"])
+    balance = model.balance(MODULI)
+    linear, finite = system.factorisation.matrix, balance.restricted(balance.stiffness(np.sin(space.points.ravel())))
+    assert np.any(linear.data == 0.0)
+    assert np.array_equal(linear.indptr, finite.indptr)
+    assert np.array_equal(linear.indices, finite.indices)
+
+
+def test_a_stiffness_serves_again_where_it_would_do_once_more(model, monkeypatch):
+    """Beside an equilibrium the corrections need no other than the first step's; from far each has its own."""
+    q, made, assemble = np.array([6.0, 2.0]), [0], TissueBalance.stiffness
+
+    def counted(*of, **named):
+        made[0] += 1
+        return assemble(*of, **named)
+
+    monkeypatch.setattr(TissueBalance, "stiffness", counted)
+    far = model.solve(MODULI, q)
+    from_far, made[0] = made[0], 0
+    near = model.solve(MODULI, 1.01 * q, start=far.displacement, nearby=far.factorisation)
+    assert far.path.iterations - far.path.steps >= from_far - far.path.steps > 1
+    assert made[0] < near.path.iterations
+    forces, size = near.balance.residual(near.values)
+    assert np.linalg.norm(model.constraint.free.T @ forces) <= model.settings.tolerance * size
 
 
 def test_derivatives_by_poissons_ratio_are_those_of_the_solution(meshes):

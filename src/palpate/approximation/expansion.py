@@ -25,7 +25,7 @@ from palpate.progress import Progress, silent
 
 REACH = 0.8  # of ln E, within which it is trusted
 COARSE = 3e-2  # of the forces: for the equilibrium whose stiffness is factorised
-DERIVATIVES = 1e-5  # relative residual: those of a coarse equilibrium, which others replace where they decide
+DERIVATIVES = 1e-4  # relative residual: those of a coarse equilibrium, which others replace where they decide
 FEW = 24  # moduli and modes, all of whose derivatives cost less than the iterations that they spare
 
 

@@ -11,7 +11,7 @@ from scipy import sparse
 from palpate.mechanics.hyperelastic import Elements, Moduli
 from palpate.mechanics.linearised import LinearisedSystem, symmetric_part
 from palpate.mechanics.loads import Load, summed
-from palpate.mechanics.pattern import BlockPattern, Restriction, Stiffness
+from palpate.mechanics.pattern import BlockPattern, Restriction, Stiffness, restricted
 from palpate.mechanics.rigid import rigid_modes
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import factorise
@@ -82,7 +82,7 @@ class TissueBalance:
         """F^T K F (n_free, n_free), mN/mm, of a stiffness K (n_dof, n_dof)."""
         if isinstance(stiffness, sparse.bsr_matrix):  # no load follows the body
             return self.restriction.of(stiffness)
-        return sparse.csr_matrix(sparse.csr_matrix(self.free.T @ stiffness) @ self.free)
+        return restricted(sparse.csr_matrix(stiffness), self.free)
 
     def factorise(self, stiffness: Stiffness) -> Factorisation:
         """Factorisation of F^T K F (n_free, n_free), of its symmetric part where loads follow; `SolverError`."""

@@ -91,8 +91,14 @@ class Elements:
 
     def smallest_volume(self, displacement: Array) -> tuple[float, int]:
         """Smallest J at a quadrature point and the number of its element; u (n_points, 3) mm."""
-        F = self.deformation(displacement)
-        volume = self.law.volume(F.reshape(-1, 3, 3)).reshape(F.shape[:2]).min(axis=1)
+        volume = np.empty(len(self.cells))
+
+        def fill(part: slice) -> None:
+            """Those of the elements `part`."""
+            F = self.deformation(displacement, part)
+            volume[part] = self.law.volume(F.reshape(-1, 3, 3)).reshape(F.shape[:2]).min(axis=1)
+
+        mapped(fill, self._parts(CHUNK))
         worst = int(np.argmin(volume))
         return float(volume[worst]), worst
 
@@ -133,13 +139,20 @@ class Elements:
 
     def pressure_ahead(self, displacement: Array, change: Array, moduli: Moduli) -> Array:
         """Mean pressures lambda_m (u' + u'' dJ_mean) (n_cells,) kPa, with dJ_mean linear in du (n_points, 3) mm."""
-        F = self.deformation(displacement)
-        flat = F.reshape(-1, 3, 3)
-        mean = self._mean(self.law.volume(flat).reshape(F.shape[:2]))
-        slope = np.swapaxes(change[self.cells], 1, 2)[:, None] @ self.gradients
-        growth = np.einsum("nij,nij->n", self.law.volume_gradient(flat), slope.reshape(-1, 3, 3)).reshape(F.shape[:2])
-        pressure = self.law.bulk_pressure(mean) + self.law.bulk_stiffness(mean) * self._mean(growth)
-        return np.asarray(moduli.mean * pressure)
+        pressure = np.empty(len(self.cells))
+
+        def fill(part: slice) -> None:
+            """Those of the elements `part`."""
+            F, weights = self.deformation(displacement, part), self.weights[part]
+            flat, shape = F.reshape(-1, 3, 3), F.shape[:2]
+            mean = (self.law.volume(flat).reshape(shape) * weights).sum(axis=1)
+            slope = np.swapaxes(change[self.cells[part]], 1, 2)[:, None] @ self.gradients[part]
+            growth = (self.law.volume_gradient(flat) * slope.reshape(-1, 3, 3)).reshape(*shape, 9).sum(axis=2)
+            ahead = self.law.bulk_stiffness(mean) * (growth * weights).sum(axis=1)
+            pressure[part] = moduli.mean[part] * (self.law.bulk_pressure(mean) + ahead)
+
+        mapped(fill, self._parts(CHUNK))
+        return pressure
 
     def stiffness(self, displacement: Array, moduli: Moduli, *, pressure: Array | None = None) -> Array:
         """Derivatives of the forces at u (n_points, 3): blocks (n_cells * n_a * n_a, 9), mN/mm, of pairs of points.

@@ -27,6 +27,7 @@ from palpate.mechanics.material import (
     material_force_along,
     material_forces,
 )
+from palpate.mechanics.pattern import restricted
 from palpate.mechanics.rigid import linear_displacements, rigid_modes
 from palpate.mechanics.solvers.conjugate_gradients import times
 from palpate.mechanics.solvers.contract import EXACT, Factorisation, together
@@ -411,7 +412,7 @@ def linear_model(
         else:
             whole = tissue_stiffness(space, region, tissue.poisson_ratio, dilatation=dilatation)
             parts = [(lame_parts(tissue.poisson_ratio, dilatation), whole)]
-        return [(region, w, k, sparse.csr_matrix(sparse.csr_matrix(free.T @ k) @ free)) for w, k in parts]
+        return [(region, w, k, restricted(k, free)) for w, k in parts]
 
     meshed = [number for number, tissue in enumerate(tissues) if tissue.meshed]
     parts = [part for of_tissue in mapped(assembled, meshed) for part in of_tissue]

@@ -68,13 +68,33 @@ class Restriction:
 
 def restriction(constraint: Constraint, pattern: sparse.bsr_matrix[np.float64]) -> Restriction:
     """Restriction to the free displacements of `constraint`, for matrices with the blocks of `pattern` (n, n)."""
-    free = constraint.free
-    columns = free.tocsc()
-    empty = np.zeros(0, dtype=np.int32)
-    if not (np.all(np.diff(columns.indptr) == 1) and np.all(columns.data == 1.0)):
+    free, empty = constraint.free, np.zeros(0, dtype=np.int32)
+    selected = selection(free)
+    if selected is None:
         return Restriction(free, None, empty, empty)
     numbers = np.arange(pattern.nnz, dtype=np.int32).reshape(pattern.data.shape)
     numbered = sparse.bsr_matrix((numbers, pattern.indices, pattern.indptr), shape=pattern.shape).tocsr()
-    chosen = sparse.csr_matrix(numbered[columns.indices][:, columns.indices])
+    chosen = sparse.csr_matrix(numbered[selected][:, selected])
     chosen.sort_indices()
     return Restriction(free, np.asarray(chosen.data), chosen.indices, chosen.indptr)
+
+
+def selection(free: sparse.csr_matrix[np.float64]) -> NDArray[np.int32] | None:
+    """Numbers (n_free,) of the displacements that F (n_dof, n_free) selects; None where it combines some."""
+    columns = free.tocsc()
+    selects = np.all(np.diff(columns.indptr) == 1) and np.all(columns.data == 1.0)
+    return np.asarray(columns.indices) if selects else None
+
+
+def restricted(
+    matrix: sparse.csr_matrix[np.float64], free: sparse.csr_matrix[np.float64]
+) -> sparse.csr_matrix[np.float64]:
+    """F^T K F (n_free, n_free), mN/mm, of a matrix K (n_dof, n_dof); where F only selects with entries that are zero.
+
+    Matrices of one body so have one pattern, under each law, and one plan of the solver's.
+    """
+    selected = selection(free)
+    product = free.T @ matrix @ free if selected is None else matrix[selected][:, selected]
+    found = sparse.csr_matrix(product)
+    found.sort_indices()
+    return found
