@@ -10,8 +10,8 @@ predictor in which **the boundary's increment enters through the tangent**,
 is corrected by Newton's method with a line search on du . R (Bathe, Finite Element Procedures, 2014, section 8.4;
 Crisfield, vol. 1, 1991, section 9.4). A factorisation costs as much as thirty solutions, so an old one preconditions
 conjugate gradients with the new tangent for as long as few steps of them do (inexact Newton; Dembo, Eisenstat &
-Steihaug, SIAM J. Numer. Anal. 19 (1982) 400-408). An old tangent serves once more where that ends the step if it takes
-as large a share off the residual as before (modified Newton; Bathe, section 8.4.1).
+Steihaug, SIAM J. Numer. Anal. 19 (1982) 400-408). At the end of the way an old tangent serves once more if
+that ends it, taking as large a share off the residual as before (modified Newton; Bathe, section 8.4.1).
 
 Nearly incompressible elements would answer the second-order volume error of a step with a pressure that makes the
 tangent indefinite. So the tangent takes the pressures that the last linear solve foresaw: Newton's method for the mixed
@@ -177,7 +177,7 @@ def _step(way: _Way, path: NewtonPath, length: float) -> NewtonPath:
             return path
         # As far as the next residual will be from zero anyway, and no further than the tolerance asks for.
         forcing = max(float(np.clip(norm / path.force, *FORCING)), 0.3 * tolerance * path.force / norm)
-        if norm / before > tolerance * path.force / norm:  # the stiffness of before would not do once more
+        if ahead < 1.0 or norm / before > tolerance * path.force / norm:  # a step would go on from pressures of before
             stiffness = balance.stiffness(path.displacement, path.pressure)
         before = norm
         free, path = _solved(way, path, stiffness, -residual, forcing)
