@@ -50,7 +50,7 @@ def invert(
 
     States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle of the
     bounds and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows
-    ends near. At last blocks that were fixed are free, see `with_released`.
+    ends near. At last blocks that were fixed are free, see `ended`.
     Raises `ConfigurationError` for an unknown Poisson's ratio with another law, `EstimationError`s of solving; an
     estimate that did not converge says so in its minimum's outcome.
     """
