@@ -73,11 +73,15 @@ def from_starts(
             continue
         begin = replace(begun(first.objective, screened[number].unknowns), checks=SolveCounts() - made)  # its own cost
         end = minimised(begin, bounds, COMPARED, progress=progress, title=f"start {number + 1}")
-        met = next((i for i, near in enumerate(ends) if same_minimum(end.minimum.unknowns, near.minimum, n)), len(ends))
-        if met < len(ends):
-            near, spent = ends[met], ends[met].minimum.evaluations + end.minimum.evaluations
-            end = replace(near, minimum=replace(near.minimum, evaluations=spent), checks=near.checks + end.counts)
-        ends[met:], belongs[groups[number]], followed = [end, *ends[met + 1 :]], met, followed + 1
+        followed += 1
+        met = [i for i, near in enumerate(ends) if same_minimum(end.minimum.unknowns, near.minimum, n)]
+        belongs[groups[number]] = met[0] if met else len(ends)
+        if not met:
+            ends.append(end)
+            continue
+        near, spent = ends[met[0]], ends[met[0]].minimum.evaluations + end.minimum.evaluations
+        minimum = replace(near.minimum, evaluations=spent)
+        ends[met[0]] = replace(near, minimum=minimum, checks=near.checks + end.counts)
     values = [(not end.minimum.converged, end.objective.total(end.minimum.evaluation)) for end in ends]
     order = sorted(range(len(ends)), key=lambda i: values[i])
     candidates = [belongs.get(group) for group in groups]

@@ -60,9 +60,7 @@ class Restriction:
         """F^T K F (n_free, n_free), mN/mm, of a matrix K (n_dof, n_dof) with the pattern that this was made for."""
         n = self.free.shape[1]
         if self.places is None:
-            product = sparse.csr_matrix(sparse.csr_matrix(self.free.T @ matrix) @ self.free)
-            product.sort_indices()
-            return product
+            return restricted(sparse.csr_matrix(matrix), self.free)
         return sparse.csr_matrix((matrix.data.ravel()[self.places], self.indices, self.indptr), shape=(n, n))
 
 
