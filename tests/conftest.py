@@ -8,12 +8,14 @@ import importlib.util
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from itertools import permutations
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from palpate.errors import PalpateError
 from palpate.findings import Finding
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import read
@@ -23,8 +25,12 @@ from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import OUTER, TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.observation.contract import Fit
+from palpate.progress import silent
 from palpate.report import render
+from palpate.study import run
 from palpate.study.case import Case, CaseTissue, Estimate, Images
+from palpate.study.case_file import read_case
+from palpate.study.check import check_case
 from palpate.study.estimated import Estimation, Iteration, ModulusEstimate, Start, TissueFit
 from palpate.study.result import CaseResult, MeshSummary, Provenance
 from palpate.study.samples import ModulusSamples
@@ -43,6 +49,34 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 if "PYTEST_XDIST_WORKER" in os.environ:  # how `make test` lets its own processes hold memory, not those they start
     for variable in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_", "GLIBC_TUNABLES"):
         os.environ.pop(variable, None)
+
+
+class SolvingError(Exception):
+    """An estimate has come to where it begins to solve."""
+
+
+@pytest.fixture
+def answer(monkeypatch):
+    """Exit code and sentence of a check's refusal, (0, "") of a case that may be solved; an estimate ends alike."""
+
+    def solve(*_args, **_options):
+        raise SolvingError
+
+    monkeypatch.setattr(run, "inverted", solve)
+
+    def of(path: Path, overrides: Sequence[str] = ()) -> tuple[int, str]:
+        checked = check_case(path, overrides, progress=silent)
+        found = (checked.exit_code, checked.problems[0].message if checked.exit_code else "")
+        try:
+            run.estimate(read_case(path, overrides))
+        except PalpateError as error:
+            ended = (error.exit_code, str(error))
+        except SolvingError:
+            ended = (0, "")
+        assert ended == found
+        return found
+
+    return of
 
 
 def tissue_at(points: np.ndarray) -> np.ndarray:

@@ -48,7 +48,6 @@ Misleading = Literal[
 Widening = Literal[
     "ratio-only",
     "map-of-prior",
-    "hardly-observed",
     "motion-below-noise",
     "correlated",
     "several-minima",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,9 +47,16 @@ def test_one_face_of_a_cube_on_a_driver_is_a_sixth_of_its_surface():
     assert "83%" in finding.message
 
 
-def test_an_organ_that_a_driver_encloses_is_hardly_observed():
+def test_of_an_organ_that_a_driver_encloses_nothing_is_left_to_observe():
     (finding,) = contact_findings(scene((1, (4, 18), (4, 18), (4, 18)), ORGAN))
-    assert finding.code == "hardly-observed"
+    assert finding.code == "touching"
+    assert "0% of its surface is left" in finding.message
+
+
+def test_the_surface_of_a_void_is_free_and_observed():
+    inside = scene((1, (4, 18), (4, 18), (4, 18)), ORGAN)
+    void = [replace(tissue, role=Role.VOID) if i == 1 else tissue for i, tissue in enumerate(inside.tissues)]
+    assert contact_findings(replace(inside, tissues=tuple(void))) == ()
 
 
 @pytest.mark.parametrize("spacing", [1.0, 2.5])

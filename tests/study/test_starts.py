@@ -9,7 +9,8 @@ import pytest
 
 from palpate.errors import ConfigurationError
 from palpate.study.case import Estimate
-from palpate.study.run import FURTHER, inversion_settings, refuse_what_cannot_be_estimated
+from palpate.study.refusals import refuse_what_cannot_be_estimated
+from palpate.study.run import FURTHER, inversion_settings
 
 
 def settings_of(n, **options):

@@ -145,11 +145,38 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
     return tuple(findings)
 
 
+def absent_tissues(before: Segmentation, after: Sequence[Segmentation]) -> dict[int, list[str]]:
+    """Names of the images without a voxel of a tissue that must be seen in all, by the tissue's index."""
+    found: dict[int, list[str]] = {}
+    for name, image in [("before", before), *zip(later_names(len(after)), after, strict=True)]:
+        present = set(np.unique(image.index).tolist())
+        for i, tissue in enumerate(image.tissues):
+            if tissue.role in OBSERVED and i not in present:
+                found.setdefault(i, []).append(name)
+    return found
+
+
+def refuse_absent(before: Segmentation, after: Sequence[Segmentation]) -> None:
+    """Raise `InputDataError` that names every absent tissue (see `absent_tissues`) with its images."""
+    absent = absent_tissues(before, after)
+    if not absent:
+        return
+    lost = [
+        f"tissue '{tissue.name}' (label {', '.join(map(str, tissue.labels)) or 'remaining'}, role {tissue.role}) has no"
+        f" voxel in {' and '.join(repr(name) for name in names)}"
+        for tissue, names in ((before.tissues[i], names) for i, names in absent.items())
+    ]
+    raise InputDataError(
+        f"{'; '.join(lost)}. An organ must be seen in all states: check its label in the images, or take the tissue out"
+        " of the case"
+    )
+
+
 def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after") -> tuple[Finding, ...]:
     """Findings on two states of one body: volumes, shifts, a mirrored image, the part that the images share.
 
-    Raises `InputDataError` when the two are the same image, an organ is missing in one or has another name there, they
-    share no part of the world, one is clearly the mirror image of the other, or two organs have exchanged their labels.
+    Raises `InputDataError` when the two are the same image, an organ has another name in one of them, they share no
+    part of the world, one is clearly the mirror image of the other, or two organs have exchanged their labels.
     """
     if [t.name for t in before.tissues] != [t.name for t in after.tissues]:
         raise InputDataError(f"'before' and '{name}' have been segmented into different tissues; use one list for both")
@@ -167,15 +194,6 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
             f"'before' and '{name}' are the same label image, voxel by voxel; without a deformation nothing can be"
             " estimated: check the two paths"
         )
-    for segmentation, where in ((before, "before"), (after, name)):
-        present = set(np.unique(segmentation.index).tolist())
-        for i, tissue in enumerate(segmentation.tissues):
-            if tissue.role in OBSERVED and i not in present:
-                labels = ", ".join(map(str, tissue.labels)) or "remaining"
-                raise InputDataError(
-                    f"tissue '{tissue.name}' (label {labels}, role {tissue.role}) has no voxel in '{where}'; an organ"
-                    " must be seen in both states: check its label in the image, or take the tissue out of the case"
-                )
     findings = _common_part(before, after, name)
     observed = [i for i, tissue in enumerate(before.tissues) if tissue.role in OBSERVED]
     findings += _mirrored(before, after, observed, name)

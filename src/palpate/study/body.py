@@ -34,10 +34,12 @@ from palpate.observation.registry import observations
 from palpate.progress import Progress
 from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
+from palpate.study.cost import ExpectedCost, cost_of_meshes
 from palpate.study.edge_length import EdgeLength
 from palpate.study.imaged import ImagedStates
 from palpate.study.meshing import ReferenceMesh, mesh_reference
 from palpate.study.poisson_ratios import with_stated_priors
+from palpate.study.refusals import NOTHING_MOVES
 from palpate.unknowns import (
     Block,
     frame_blocks,
@@ -49,11 +51,6 @@ from palpate.unknowns import (
     parameter_map,
     unit_blocks,
     wall_blocks,
-)
-
-NOTHING_MOVES = (
-    'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'
-    " modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
 )
 
 
@@ -106,6 +103,13 @@ def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
     body = Body(states, space, found.quality, width, found.edge_length, found.findings, layers=layers)
     measured, findings = _measured(body, case)
     return replace(body, measured=measured, findings=(*body.findings, *findings))
+
+
+def cost_of_bodies(bodies: Sequence[Body], case: Case) -> ExpectedCost:
+    """What an estimate on the very meshes of these bodies costs."""
+    sizes = [(body.quality.tets, 3 * len(body.space.points)) for body in bodies]
+    first = bodies[0].states
+    return cost_of_meshes(case, first.before, sizes, n_after=first.n_later)
 
 
 def strained_body(body: Body, strained: NDArray[np.float64], case: Case) -> Body:

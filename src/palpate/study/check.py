@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
-from palpate.errors import GeometryError, InputDataError, PalpateError, ResourceError
+from palpate.errors import InputDataError, PalpateError, ResourceError
 from palpate.findings import Finding, of_pair, one_a_cause, rank
-from palpate.images.checks import OBSERVED, check_pair, check_segmentation, later_names
+from palpate.images.checks import (
+    OBSERVED,
+    absent_tissues,
+    check_pair,
+    check_segmentation,
+    later_names,
+    refuse_absent,
+)
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities
 from palpate.images.registration import Registration, length_text
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.observation.observed_surface import field_of_view, observed_surfaces, seen_in
 from palpate.progress import Progress
-from palpate.study.body import Body, make_body
+from palpate.study.body import Body, cost_of_bodies, joint_problem, make_body
 from palpate.study.case import Case
 from palpate.study.case_file import read_case
 from palpate.study.case_loads import load_warnings
@@ -29,24 +33,20 @@ from palpate.study.cost import (
     LESS_MEMORY,
     MEMORY_FACTOR,
     ExpectedCost,
-    cost_of_meshes,
     expected_cost,
     free_memory_gb,
     lack_of_memory,
     machine_memory_gb,
 )
-from palpate.study.edge_length import case_domain, edge_length_of
 from palpate.study.imaged import ImagedStates, brought
-from palpate.study.meshing import refuse_edge
 from palpate.study.plausibility import unit_warnings
 from palpate.study.prediction import Prediction
-from palpate.study.read import measured, read_segmentation, read_states
+from palpate.study.provenance import file_digest
+from palpate.study.read import measured, read_case_images, read_segmentation, read_states
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
-from palpate.study.run import refuse_what_cannot_be_estimated
 from palpate.study.samples import require_samples
 
 T = TypeVar("T")
-REFUSED_FINDINGS = {"hardly-observed": GeometryError.exit_code}  # what an estimate refuses, found here as a finding
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +86,8 @@ class CheckReport:
 
     @property
     def exit_code(self) -> int:
-        """0, or the exit code of the worst class of problem, which is the highest number."""
-        return max((problem.exit_code for problem in self.problems), default=0)
+        """0, or that of the first problem, with which an estimate would end."""
+        return self.problems[0].exit_code if self.problems else 0
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON document, schema palpate.check/1."""
@@ -181,6 +181,11 @@ class _Problems:
             self.add(Problem("ResourceError", "memory is short for these images; crop them", ResourceError.exit_code))
         return None
 
+    @property
+    def refused(self) -> bool:
+        """Whether an estimate would refuse something."""
+        return any(problem.exit_code for problem in self.found)
+
     def add(self, problem: Problem) -> None:
         """Keep a problem once."""
         if problem not in self.found:
@@ -191,10 +196,11 @@ class _Problems:
         self._findings += of_pair(findings, pair)
 
     def all(self) -> tuple[Problem, ...]:
-        """Everything that was kept, one a cause, worst first."""
-        found = one_a_cause(self._findings)
-        warned = [Problem(each.code, each.message, REFUSED_FINDINGS.get(each.code, 0)) for each in found]
-        return tuple(sorted([*self.found, *warned], key=lambda problem: (-problem.exit_code, rank(problem.code))))
+        """Everything that was kept, one a cause: refusals as they were found, then warnings, worst first."""
+        warned = [p for p in self.found if not p.exit_code]
+        warned += [Problem(each.code, each.message) for each in one_a_cause(self._findings)]
+        refused = [p for p in self.found if p.exit_code]
+        return (*refused, *sorted(warned, key=lambda problem: rank(problem.code)))
 
 
 def check_case(source: Path | Case, overrides: Sequence[str], *, progress: Progress) -> CheckReport:
@@ -207,8 +213,8 @@ def checked_case(
 ) -> Checked:
     """All problems of a case, or of a case file (with overrides as in `read_case`), its organs and its expected cost.
 
-    The images are aligned, and meshed (if `meshed`, and nothing was refused before), as an estimate would. Nothing is
-    solved. Raises nothing for a bad case: that is a problem, too.
+    It does what an estimate does up to where solving begins, and refuses with the same sentence; where an estimate ends
+    it goes on, to find the other problems. Without `meshed` it ends before the mesh. Raises nothing for a bad case.
     """
     problems = _Problems()
     if isinstance(source, Case):
@@ -217,21 +223,14 @@ def checked_case(
         case = read
     else:
         return Checked(CheckReport(source.stem, problems.all()))
-    problems.attempt(lambda: refuse_what_cannot_be_estimated(case))
-    problems.attempt(lambda: require_samples(case))
     problems.warn((*unit_warnings(case), *load_warnings(case)))
     progress("reading the images")
-    whole = case.phantom is not None or case.body is not None  # nothing to read one by one
-    states = problems.attempt(lambda: read_states(case, progress=progress)) if whole else None
-    images = [] if whole else _read_pairs(case, problems)
-    pairs = [states] if states is not None else [ImagedStates(before, after, (), ()) for before, after in images]
-    pairs = [_checked_pair(problems, pair, case, number, progress) for number, pair in enumerate(pairs, start=1)]
-    firsts = np.cumsum([0, *(pair.n_later for pair in pairs)]).tolist()
-    for place, (pair, first) in enumerate(zip(pairs, firsts, strict=False)):
-        data = None if pair.mesh is not None else problems.attempt(partial(measured, case, pair, first=first))
-        pairs[place] = pair if data is None else replace(pair, data=data[0])
+    images = problems.attempt(partial(read_case_images, case, progress=progress))
+    pairs = _further_problems(problems, case, progress) if images is None else images.pairs
     if not pairs:
         return Checked(CheckReport(case.id, problems.all()), case)
+    if images is not None:
+        _remarks(problems, case, pairs)
     cost, bodies = problems.attempt(lambda: _cost(problems, pairs, case, progress, meshed=meshed)) or (None, ())
     before, after = pairs[0].before, pairs[0].after
     names = ("before", *(f"after[{i}]" for i in range(len(after))))
@@ -251,43 +250,64 @@ def checked_case(
     return Checked(report, case, tuple(pairs), bodies)
 
 
+def _remarks(problems: _Problems, case: Case, pairs: Sequence[ImagedStates]) -> None:
+    """What an estimate would warn of, what organs do to each other, and grey images that its report cannot show."""
+    for number, pair in enumerate(pairs, start=1):
+        problems.warn(pair.findings, number)
+        if pair.mesh is None:
+            problems.warn(every_finding(pair.before, pair.after, loaded=bool(case.loads)), number)
+    for grey in _grey_images(case):
+        try:
+            read_intensities(grey)
+        except InputDataError as error:
+            problems.add(Problem("report", f"the report will show labels in place of the grey image: {error}"))
+
+
 def _cost(
     problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Progress, *, meshed: bool
 ) -> tuple[ExpectedCost, tuple[Body, ...]]:
-    """What an estimate would cost on its very meshes, and these; on meshes of a guessed size where one is refused."""
+    """What an estimate would cost on its very meshes, and these; on meshes of a guessed size where one is refused.
+
+    All is made of which an estimate begins to solve; `meshed`: else nothing is.
+    """
     first = pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs), mesh=first.mesh)
-    if first.mesh is None:
-        edge = edge_length_of(case, first.before, first.after).mm
-        problems.attempt(lambda: refuse_edge(edge, case_domain(first.before, case)))
-    if any(problem.exit_code for problem in problems.all()):
-        return cost, ()
-    if not meshed or lack_of_memory(cost):
+    if problems.refused or not meshed or lack_of_memory(cost):
         problems.found += memory_problems(cost)
         return cost, ()
     bodies = [problems.attempt(partial(make_body, pair, case, progress=progress)) for pair in pairs]
     made = tuple(body for body in bodies if body is not None)
     for number, body in enumerate(made, start=1):
         problems.warn(body.findings, number)
-        if body.states.mesh is None:
-            problems.attempt(partial(_observe, body))
     if len(made) == len(pairs):
-        sizes = [(body.quality.tets, 3 * len(body.space.points)) for body in made]
-        cost = cost_of_meshes(case, first.before, sizes, n_after=first.n_later)
+        cost = cost_of_bodies(made, case)
+        if not lack_of_memory(cost):
+            problems.attempt(partial(joint_problem, made, case, progress=progress))
     problems.found += memory_problems(cost)
-    return cost, () if any(problem.exit_code for problem in problems.all()) else made
-
-
-def _observe(body: Body) -> None:
-    """Refuse what the mesh, or a later image's field of view, leaves nothing of to observe."""
-    before, after = body.states.before, body.states.after
-    for surface in observed_surfaces(body.space, before):
-        for name, image in zip(later_names(len(after)), after, strict=True):
-            view = field_of_view(before.grid, image.grid, smoothing_mm=body.smoothing_mm)
-            seen_in(surface, image, view, name=name)
+    return cost, () if problems.refused else made
 
 
 Pair = tuple[Segmentation, tuple[Segmentation, ...]]
+
+
+def _further_problems(problems: _Problems, case: Case, progress: Progress) -> tuple[ImagedStates, ...]:
+    """The states of a case that an estimate refuses, as far as they can be made, after every check on each of them."""
+    problems.attempt(partial(require_samples, case))
+    if case.phantom is not None or case.body is not None:  # nothing to read one by one
+        states = problems.attempt(partial(read_states, case, progress=progress))
+        return () if states is None else (states,)
+    found, first = list[ImagedStates](), 0
+    for before, after in _read_pairs(case, problems):
+        states = _checked_pair(problems, ImagedStates(before, after, (), ()), case, len(found) + 1, progress)
+        data = problems.attempt(partial(measured, case, states, first=first))
+        found.append(states if data is None else replace(states, data=data[0]))
+        first += states.n_later
+    return tuple(found)
+
+
+def _grey_images(case: Case) -> tuple[Path, ...]:
+    images = case.images
+    return () if images is None else tuple(g for g in (images.intensities_before, *images.intensities_after) if g)
 
 
 def _read_pairs(case: Case, problems: _Problems) -> list[Pair]:
@@ -297,9 +317,8 @@ def _read_pairs(case: Case, problems: _Problems) -> list[Pair]:
         return []
     table = images.names
     names = problems.attempt(lambda: read_label_table(table)) if table else None
-    for grey in (images.intensities_before, *images.intensities_after):
-        if grey is not None:
-            problems.attempt(partial(read_intensities, grey))
+    for grey in _grey_images(case):
+        problems.attempt(partial(file_digest, grey))
     pairs: list[Pair] = []
     for reference, later in ((images.before, images.after), *((pair.before, pair.after) for pair in case.pairs)):
         before = problems.attempt(partial(read_segmentation, case, reference, names, None))
@@ -317,30 +336,17 @@ def _checked_pair(
 
     An organ that is absent is named, and left out of the other checks; the images are then not aligned.
     """
-    if states.mesh is not None:  # its voxels only show it
-        return states
     before, after = states.before, states.after
-    names, where = later_names(len(after)), f"pair {number}: " if number > 1 else ""
-    absent: dict[str, list[str]] = {}  # tissue -> the images that do not show it, of those that must
-    for name, image in [("before", before), *zip(names, after, strict=True)]:
-        present = set(np.unique(image.index).tolist())
-        for i, tissue in enumerate(image.tissues):
-            if tissue.role in OBSERVED and i not in present:
-                absent.setdefault(tissue.name, []).append(name)
-    for lost, images in absent.items():
-        text = (
-            f"{where}tissue '{lost}' has no voxel in {' and '.join(repr(name) for name in images)}; an organ must be"
-            " seen in both states: check its label in the image, or take the tissue out of the case"
-        )
-        problems.add(Problem(InputDataError.__name__, text, InputDataError.exit_code))
-    if case.images is not None and not absent:
+    problems.attempt(partial(refuse_absent, before, after))
+    absent = set(absent_tissues(before, after))
+    if not absent:
         states = problems.attempt(partial(brought, before, after, method=case.align, progress=progress)) or states
         problems.warn(states.findings, number)
     in_place = bool(states.bones) or not any(tissue.role is Role.RIGID for tissue in before.tissues)
     before, after = _without(before, absent), tuple(_without(image, absent) for image in states.after)
     problems.warn(check_segmentation(before, "before"), number)
-    problems.attempt(lambda: refuse_unmeshable(before, "before"))
-    for name, image in zip(names, after, strict=True):
+    problems.attempt(partial(refuse_unmeshable, before, "before"))
+    for name, image in zip(later_names(len(after)), after, strict=True):
         problems.warn(check_segmentation(image, name), number)
         problems.attempt(partial(refuse_unmeshable, image, name))
         if in_place:
@@ -352,9 +358,9 @@ def _checked_pair(
     return replace(states, before=before, after=after)
 
 
-def _without(image: Segmentation, absent: dict[str, list[str]]) -> Segmentation:
+def _without(image: Segmentation, absent: Collection[int]) -> Segmentation:
     """The image with the absent tissues made void, which nobody looks at."""
-    tissues = tuple(replace(t, role=Role.VOID) if t.name in absent else t for t in image.tissues)
+    tissues = tuple(replace(t, role=Role.VOID) if i in absent else t for i, t in enumerate(image.tissues))
     return replace(image, tissues=tissues)
 
 

@@ -13,15 +13,15 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 
 BEHIND, IN_FRONT = ("sacrum", "coccyx"), ("prostate", "bladder")  # in every pelvis
-LEAST_OBSERVED = 0.1  # below, an estimate is refused (see observation.observed_surface)
+PRESCRIBED = (Role.DRIVER, Role.RIGID)
 LITTLE_OBSERVED = 0.5
 
 
 def contact_findings(segmentation: Segmentation) -> tuple[Finding, ...]:
-    """A finding for each `estimate` tissue that touches a driver, a bone, air or the image's border with much of it.
+    """A finding for each `estimate` tissue that touches a driver, a bone or the image's border with much of it.
 
-    Such faces are prescribed or cut and are left out of the observation. Code "touching", or "hardly-observed" when
-    less than a tenth of the surface is left, which an estimate refuses.
+    Such faces are prescribed or cut and are left out of the observation, as `observed_surface` does on the mesh, which
+    refuses what leaves less than a tenth.
     """
     faces = _shared_faces(segmentation)
     tissues = segmentation.tissues
@@ -30,7 +30,7 @@ def contact_findings(segmentation: Segmentation) -> tuple[Finding, ...]:
         total = float(faces[i].sum() - faces[i, i])
         if tissue.role is not Role.ESTIMATE or not total:
             continue
-        held = {tissues[j].name: faces[i, j] / total for j in range(len(tissues)) if not tissues[j].meshed}
+        held = {tissues[j].name: faces[i, j] / total for j in range(len(tissues)) if tissues[j].role in PRESCRIBED}
         held["the image's border"] = faces[i, -1] / total
         shares = {name: share for name, share in held.items() if share >= 0.01}
         left = 1.0 - sum(held.values())
@@ -41,7 +41,7 @@ def contact_findings(segmentation: Segmentation) -> tuple[Finding, ...]:
             f"'{tissue.name}' touches {words}; those faces say nothing about its stiffness, and {left:.0%} of its"
             " surface is left to observe"
         )
-        findings.append(Finding("touching" if left >= LEAST_OBSERVED else "hardly-observed", text, tissue.name))
+        findings.append(Finding("touching", text, tissue.name))
     return tuple(findings)
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage
 
+from palpate.errors import ResourceError
 from palpate.images.distance import REACH_MM, window_around
 from palpate.images.segmentation import Segmentation
 from palpate.images.surface_alignment import shown_tissues
@@ -187,3 +188,9 @@ def lack_of_memory(cost: ExpectedCost) -> str:
     if has is None or cost.memory_gb <= MEMORY_FACTOR * has:
         return ""
     return f"about {cost.memory_gb:.1f} GB of memory would be needed and this machine has {has:.1f} GB"
+
+
+def refuse_lack(cost: ExpectedCost) -> None:
+    """Raise `ResourceError` for what `lack_of_memory` tells, with what to do."""
+    if lack := lack_of_memory(cost):
+        raise ResourceError(f"{lack}; {LESS_MEMORY}")

@@ -11,7 +11,7 @@ import numpy as np
 from palpate.errors import InputDataError
 from palpate.findings import Finding
 from palpate.images.alignment import Alignment, Motion, align, moved
-from palpate.images.checks import check_headers, check_images, later_names
+from palpate.images.checks import check_headers, check_images, later_names, refuse_absent
 from palpate.images.registration import ON, Registration, registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.surface_alignment import align_surfaces, surface_maps
@@ -72,8 +72,10 @@ def aligned(
     """Bring the later images to the first (`method`: "rigid-tissues", "surfaces" or "none") and check them all.
 
     `loaded`: whether known loads act on the body, for what is found of its motion.
-    Raises `InputDataError` as `check_images`, `align` and `refuse_lost` do, `GeometryError` as `refuse_unmeshable`.
+    Raises `InputDataError` as `refuse_absent`, `align`, `check_images` and `refuse_lost` do, `GeometryError` as
+    `refuse_unmeshable`.
     """
+    refuse_absent(before, after)
     found = brought(before, after, method=method, progress=progress)
     progress("checking the images")
     findings, images = [*found.findings, *check_images(before, found.after)], found.after

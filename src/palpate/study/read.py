@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +24,31 @@ from palpate.progress import Progress, silent
 from palpate.study.case import Case
 from palpate.study.imaged import ImagedStates, aligned
 from palpate.study.meshed_body import mesh_states, with_prescribed
-from palpate.study.provenance import file_digest
-from palpate.study.refusals import refuse_large
+from palpate.study.provenance import file_digest, input_digests
+from palpate.study.refusals import refuse_large, refuse_still, refuse_what_cannot_be_estimated
+from palpate.study.samples import require_samples
 from palpate.study.schema import nearest, shown
+
+
+@dataclass(frozen=True, slots=True)
+class CaseImages:
+    """The states of every pair of a case, aligned and checked; inputs: SHA-256 of each file by its key."""
+
+    pairs: tuple[ImagedStates, ...]
+    inputs: Mapping[str, str]
+
+
+def read_case_images(case: Case, *, progress: Progress = silent) -> CaseImages:
+    """All that an estimate reads, after which it refuses nothing for which no mesh is needed.
+
+    Raises `ConfigurationError` where nothing can move or tissues do not fit the images, `InputDataError` for files that
+    cannot be used, `GeometryError` for organs that cannot be meshed, `ResourceError` where a library is missing.
+    """
+    refuse_what_cannot_be_estimated(case)
+    require_samples(case)
+    pairs = (read_states(case, progress=progress), *read_pairs(case, progress=progress))
+    refuse_still(case, *((pair.before, pair.bones) for pair in pairs))
+    return CaseImages(pairs, input_digests(case, *(pair.inputs for pair in pairs)))
 
 
 def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:

@@ -1,16 +1,18 @@
-"""What no estimate can begin with (organs too small, thin or lost), and where its linear law ends."""
+"""What no estimate can begin with (nothing that moves, organs too small, thin or lost), and where its law ends."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from palpate.errors import GeometryError, InputDataError, ResourceError
+from palpate.errors import ConfigurationError, GeometryError, InputDataError, ResourceError
 from palpate.findings import Finding
+from palpate.images.alignment import Motion
 from palpate.images.checks import SMALL_VOXELS, VOLUME_IMPLAUSIBLE
 from palpate.images.distance import window_around
 from palpate.images.segmentation import Segmentation
@@ -18,11 +20,48 @@ from palpate.images.tissue import Role
 from palpate.mechanics.element import largest_strains
 from palpate.mechanics.laws.contract import Law
 from palpate.mesh.space import LagrangeSpace
+from palpate.study.case import Case
 from palpate.study.cost import image_memory_gb, machine_memory_gb
 
 ORGANS = (Role.ESTIMATE, Role.DRIVER)
 LINEAR_RANGE = 0.10  # principal strain: beyond it the squares that the linear law leaves out are tenths of it
 MOST_BEYOND = 0.01  # share of the meshed volume
+NOTHING_MOVES = (
+    'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'
+    " modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
+)
+MOVES_MM = 1e-6  # less is rounding
+
+
+def refuse_what_cannot_be_estimated(case: Case) -> None:
+    """Say before any image is read that there is no later state, or that nothing can move: `ConfigurationError`."""
+    if case.images is not None and not case.images.after:
+        raise ConfigurationError(
+            "the key 'after' is missing in [images]; an estimate needs one or more later states of the body"
+        )
+    if case.estimate.method != "gauss-newton":
+        raise ConfigurationError(
+            f"[estimate] method = '{case.estimate.method}' is none: write 'gauss-newton', which ends at the same"
+            " minimum, or leave the key out"
+        )
+    movers = [tissue for tissue in case.tissues if tissue.role in (Role.DRIVER, Role.RIGID)]
+    if case.tissues and case.images is not None and not movers and not case.loads and not case.data:
+        raise ConfigurationError(NOTHING_MOVES)
+
+
+def refuse_still(case: Case, *pairs: tuple[Segmentation, Sequence[Mapping[int, Motion]]]) -> None:
+    """Raise `ConfigurationError` where no force, no driver and no moving bone can move the body of any pair.
+
+    pairs: each one's reference image, and the motions of bones in each later state, by tissue index.
+    """
+    if case.known_force:
+        return
+    for before, bones in pairs:
+        ends = before.grid.world(np.array(list(product(*((0.0, n - 1.0) for n in before.grid.shape)))))
+        moved = [np.abs(motion.apply(ends) - ends).max() for motions in bones for motion in motions.values()]
+        if any(tissue.role is Role.DRIVER for tissue in before.tissues) or max(moved, default=0.0) > MOVES_MM:
+            return
+    raise ConfigurationError(NOTHING_MOVES)
 
 
 def refuse_unmeshable(segmentation: Segmentation, name: str) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from palpate.errors import ConfigurationError, EstimationError, ResourceError
+from palpate.errors import EstimationError
 from palpate.findings import Finding, of_pair
 from palpate.images.tissue import Role
 from palpate.inversion import Bounds, Inversion, InversionSettings
@@ -16,11 +16,11 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Progress, about, during, silent
-from palpate.study.body import NOTHING_MOVES, Body, joint_problem, make_body
+from palpate.study.body import Body, cost_of_bodies, joint_problem, make_body
 from palpate.study.case import SOUGHT_RATIOS, Case, Mechanics
 from palpate.study.case_body import LAW_NAMES
 from palpate.study.case_loads import load_warnings
-from palpate.study.cost import LESS_MEMORY, ExpectedCost, cost_of_meshes, expected_cost, lack_of_memory
+from palpate.study.cost import ExpectedCost, expected_cost, refuse_lack
 from palpate.study.estimated import Estimation
 from palpate.study.estimation import Observed, conclude
 from palpate.study.imaged import ImagedStates
@@ -28,10 +28,9 @@ from palpate.study.inverted import inverted
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.poisson_ratios import with_found_ratios
 from palpate.study.provenance import image_names, input_digests, software_versions
-from palpate.study.read import read_pairs, read_states
+from palpate.study.read import read_case_images, read_states
 from palpate.study.refusals import linear_strain_warnings
 from palpate.study.result import CaseResult, MeshResult, MeshSummary, PairResult, Provenance
-from palpate.study.samples import require_samples
 from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
 from palpate.unknowns import ParameterMap, eta_of_ratio
@@ -54,24 +53,21 @@ def estimate(
     iteration that did not converge is no error but a result whose status says so, with no values.
     """
     began = time.perf_counter()
-    refuse_what_cannot_be_estimated(case)
-    require_samples(case)
-    during("reading", progress)("reading and aligning the images")
     reading = during("reading", progress)
-    states, further = read_states(case, progress=reading), read_pairs(case, progress=reading)
-    cost = expected_cost(case, states.before, states.after, n_pairs=1 + len(further), mesh=states.mesh)
-    if lack := lack_of_memory(cost):
-        raise ResourceError(f"{lack}; {LESS_MEMORY}")
+    reading("reading and aligning the images")
+    images = read_case_images(case, progress=reading)
+    states, *further = images.pairs
+    cost = expected_cost(case, states.before, states.after, n_pairs=len(images.pairs), mesh=states.mesh)
+    refuse_lack(cost)
     if condition is not None:
         condition(cost)
     progress(_forecast(cost))
     if case.phantom:
         stated = [(t.name, t.youngs_modulus_kpa) for t in states.before.tissues if t.role is Role.ESTIMATE]
         truth = {name: value for name, value in stated if value is not None}
-    inputs = input_digests(case, states.inputs, *(pair.inputs for pair in further))
     seconds = time.perf_counter() - began
-    result = estimate_states(states, case, progress=progress, truth=truth, read_seconds=seconds, further=further)
-    return replace(result, provenance=replace(result.provenance, inputs=inputs))
+    result = estimate_states(states, case, progress=progress, truth=truth, read_seconds=seconds, further=tuple(further))
+    return replace(result, provenance=replace(result.provenance, inputs=images.inputs))
 
 
 @blas_on_one_thread()
@@ -89,13 +85,12 @@ def estimate_states(
     `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; `further`: pairs of the same
     body, each with its own reference state, which are meshed on their own and share the moduli.
     """
-    require_samples(case)
     clock = [time.perf_counter()]
     bodies = tuple(make_body(pair, case, progress=during("meshing", progress)) for pair in (states, *further))
     body = bodies[0]
-    if progress is not silent:
-        sizes = [(made.quality.tets, 3 * len(made.space.points)) for made in bodies]
-        progress(_forecast(cost_of_meshes(case, states.before, sizes, n_after=states.n_later)))
+    cost = cost_of_bodies(bodies, case)
+    refuse_lack(cost)
+    progress(_forecast(cost))
     clock.append(time.perf_counter())
     problem = joint_problem(bodies, case, progress=during("linear law", progress))
     clock.append(time.perf_counter())
@@ -251,22 +246,6 @@ def strain_warnings(case: Case, bodies: tuple[Body, ...], estimation: Estimation
     motions = iter(estimation.displacements)
     moved = [(body.space, [next(motions) for _ in body.states.bones]) for body in bodies]
     return linear_strain_warnings(case.mechanics.material_law, *moved, images=image_names(case))
-
-
-def refuse_what_cannot_be_estimated(case: Case) -> None:
-    """Say before any image is read that there is no later state, or that nothing can move: `ConfigurationError`."""
-    if case.images is not None and not case.images.after:
-        raise ConfigurationError(
-            "the key 'after' is missing in [images]; an estimate needs one or more later states of the body"
-        )
-    if case.estimate.method != "gauss-newton":
-        raise ConfigurationError(
-            f"[estimate] method = '{case.estimate.method}' is none: write 'gauss-newton', which ends at the same"
-            " minimum, or leave the key out"
-        )
-    movers = [tissue for tissue in case.tissues if tissue.role in (Role.DRIVER, Role.RIGID)]
-    if case.tissues and case.images is not None and not movers and not case.loads and not case.data:
-        raise ConfigurationError(NOTHING_MOVES)
 
 
 def _remarks(case: Case, *bodies: Body) -> tuple[Finding, ...]:

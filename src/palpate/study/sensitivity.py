@@ -10,7 +10,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -37,13 +37,12 @@ from palpate.study.case_body import LAW_NAMES
 from palpate.study.case_file import case_tables
 from palpate.study.edge_length import edge_length_of
 from palpate.study.estimation import conclude
-from palpate.study.imaged import ImagedStates
 from palpate.study.inverted import inverted
 from palpate.study.outputs import OutputFolder, read_json, write_json
-from palpate.study.provenance import input_digests, software_versions
-from palpate.study.read import read_pairs, read_states
+from palpate.study.provenance import software_versions
+from palpate.study.read import CaseImages, read_case_images
 from palpate.study.result import Provenance, closing, json_object
-from palpate.study.run import inversion_settings, observed_of, refuse_what_cannot_be_estimated
+from palpate.study.run import inversion_settings, observed_of
 from palpate.study.variations import SobolResult, Variation, fast_variations, sobol_result, voxel_mm
 from palpate.uncertainty import require_salib
 
@@ -119,19 +118,6 @@ class Variant:
     makes: str = "model"
 
 
-@dataclass(frozen=True, slots=True)
-class _Images:
-    """The first pair and the further ones of a case, and the digests of their files."""
-
-    first: ImagedStates
-    further: tuple[ImagedStates, ...]
-    inputs: Mapping[str, str] = field(default_factory=dict)
-
-    def bodies(self, case: Case, progress: Progress) -> Bodies:
-        """All of them meshed."""
-        return tuple(make_body(pair, case, progress=progress) for pair in (self.first, *self.further))
-
-
 @blas_on_one_thread()
 def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progress: Progress = silent) -> Sensitivity:
     """Estimate a case, and say how each modulus depends on what it rests on.
@@ -142,7 +128,6 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
     itself has no estimate, `ResourceError` where `sobol` asks for SALib and it is not installed.
     """
     began, kept = time.perf_counter(), kept or Kept()
-    refuse_what_cannot_be_estimated(case)
     if case.estimate.seeks_poisson_ratios:
         raise ConfigurationError(
             "how the moduli depend on Poisson's ratios is part of what is shown here, and this case seeks them as"
@@ -151,15 +136,16 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
     if sobol:
         require_salib()
     progress("reading the images")
-    images = _read(case, progress)
+    images = read_case_images(case, progress=progress)
     key = kept_under(case, images.inputs)
-    bodies = cache(lambda: images.bodies(case, progress))
+    bodies = cache(lambda: _meshed(images, case, progress))
     base = kept.get(f"estimate-sobol-{sobol}", key)
     if base is None:
         base = json_object(_estimated(case, bodies(), sobol, progress))
         kept.put(f"estimate-sobol-{sobol}", key, base)
     variations = [Variation(**each) for each in base["variations"]]
-    edge_mm = edge_length_of(case, images.first.before, images.first.after).mm
+    first = images.pairs[0]
+    edge_mm = edge_length_of(case, first.before, first.after).mm
     variants = list(variants_of(case, edge_mm))
     for number, variant in enumerate(variants, start=1):
         part = kept.get(variant.name, key)
@@ -180,9 +166,8 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
     )
 
 
-def _read(case: Case, progress: Progress) -> _Images:
-    first, further = read_states(case, progress=progress), read_pairs(case, progress=progress)
-    return _Images(first, further, input_digests(case, first.inputs, *(pair.inputs for pair in further)))
+def _meshed(images: CaseImages, case: Case, progress: Progress) -> Bodies:
+    return tuple(make_body(pair, case, progress=progress) for pair in images.pairs)
 
 
 def kept_under(case: Case, inputs: Mapping[str, str]) -> str:
@@ -260,7 +245,7 @@ def variants_of(case: Case, edge_mm: float) -> Iterator[Variant]:
 
 
 def _varied(
-    variant: Variant, images: _Images, bodies: Callable[[], Bodies], base: Mapping[str, Any], progress: Progress
+    variant: Variant, images: CaseImages, bodies: Callable[[], Bodies], base: Mapping[str, Any], progress: Progress
 ) -> Variation:
     """One variant estimated anew; one that has no estimate says why."""
     began, case, changes, reason = time.perf_counter(), variant.case, None, ""
@@ -270,7 +255,8 @@ def _varied(
         if variant.makes == "model":
             made = bodies()
         else:
-            made = (_read(case, progress) if variant.makes == "images" else images).bodies(case, progress)
+            own = read_case_images(case, progress=progress) if variant.makes == "images" else images
+            made = _meshed(own, case, progress)
         edge = made[0].edge_length
         if variant.makes == "mesh" and edge and edge.mm != case.mesh.edge_length_mm:
             raise GeometryError(f"no mesh of {variant.setting} is fit to compute with")
