@@ -3,9 +3,10 @@
     python benchmarks/fuzz_cases.py --runs 1000000 --commands 4000 --output fuzz_cases.json
 
 With a fixed seed. A run makes one spoilt input (`spoilt_cases.py`) and reads it with the functions that the command
-line calls. `--commands` cases go through `palpate check` itself, in a process of their own. A finding is an exception
-that is no `PalpateError`, an exit code of another class, a sentence with control characters, of several lines or over
-2000 letters, a traceback, the request to report a bug, or more than 2 s of processor time. Prints JSON.
+line calls. `--commands` cases go through `palpate check` itself, in a process of their own, and through `palpate
+estimate` up to where solving begins. A finding is an exception that is no `PalpateError`, an exit code of another
+class, a sentence with control characters, of several lines or over 2000 letters, a traceback, the request to report a
+bug, more than 2 s of processor time, or another answer of `check` than of `estimate`. Prints JSON.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import nibabel
 import numpy as np
@@ -34,7 +36,7 @@ from spoilt_cases import CASES, NAMES, override, spoilt_case, spoilt_table, toml
 from palpate.cli import main as palpate_command
 from palpate.errors import PalpateError
 from palpate.images import read_label_table
-from palpate.study import read_case
+from palpate.study import read_case, run
 
 importlib.import_module("palpate.study.check")  # before processes are forked that would import it each
 
@@ -104,30 +106,41 @@ def one_run(rng: random.Random, folder: Path) -> tuple[str, Outcome, bytes]:
 
 
 def command_run(rng: random.Random, folder: Path) -> tuple[str, Outcome, bytes]:
-    """`palpate check` on one spoilt case whose images are there, in a process of its own."""
+    """`palpate check` on one spoilt case whose images are there; an estimate must refuse it alike."""
     content = spoilt_case(rng, CASES[:2])
     (folder / "case.toml").write_bytes(content)
     (folder / "names.json").write_text(json.dumps(NAMES))
     arguments = [word for _ in range(rng.choice((0, 0, 1))) for word in ("--set", override(rng))]
     if any("\0" in word or "phantom" in word for word in arguments) or b"phantom" in content:
         arguments = []  # no argument of a process holds a zero byte, and phantoms take minutes
-    with (folder / "said.txt").open("w+b") as said:
-        pid = os.fork()
-        if pid == 0:
-            become_command(["check", str(folder / "case.toml"), "--quiet", *arguments], said.fileno())
-        _, status, usage = os.wait4(pid, 0)
-        said.seek(0)
-        words = said.read().decode("utf-8", errors="replace")
-    code = os.waitstatus_to_exitcode(status)
+    case, out = str(folder / "case.toml"), str(folder / "out")
+    code, words, seconds = said_by(["check", case, "--quiet", *arguments], folder)
     wrong = code not in COMMAND_CODES or "Traceback" in words or "report it" in words or (code != 0) != bool(words)
     flaw = f"exit code {code}: {words[-1000:]}" if wrong else ""
-    seconds = usage.ru_utime + usage.ru_stime
     slow = "slow" if seconds > SLOW_SECONDS and code == 2 else ""
+    ended, sentence, _ = said_by(["estimate", case, "--output", out, "--quiet", *arguments], folder)
+    if not flaw and (ended != code or sentence.strip().removeprefix("palpate: ") not in words):
+        flaw = f"check ends with {code}: {words[-500:]}; estimate with {ended}: {sentence[-500:]}"
     return "command", Outcome(f"exit code {code}", seconds, flaw or slow), content + repr(arguments).encode()
 
 
+def said_by(argv: list[str], folder: Path) -> tuple[int, str, float]:
+    """Exit code, words and processor time (s) of a command in a process of its own."""
+    with (folder / "said.txt").open("w+b") as said:
+        pid = os.fork()
+        if pid == 0:
+            become_command(argv, said.fileno())
+        _, status, usage = os.wait4(pid, 0)
+        said.seek(0)
+        words = said.read().decode("utf-8", errors="replace")
+    return os.waitstatus_to_exitcode(status), words, usage.ru_utime + usage.ru_stime
+
+
 def become_command(argv: list[str], said: int) -> None:
-    """The forked process: run `palpate` with these arguments under limits, say everything into `said`, and end."""
+    """The forked process: run `palpate` with these arguments under limits, say everything into `said`, and end.
+
+    An estimate ends where it begins to solve.
+    """
     code = 99
     try:
         os.dup2(said, 1)
@@ -135,6 +148,7 @@ def become_command(argv: list[str], said: int) -> None:
         sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
         resource.setrlimit(resource.RLIMIT_CPU, (COMMAND_SECONDS, COMMAND_SECONDS))
         warnings.simplefilter("default")
+        run.inverted = solving_begins
         try:
             code = palpate_command(argv)
         except SystemExit as stop:
@@ -143,6 +157,11 @@ def become_command(argv: list[str], said: int) -> None:
         sys.stderr.flush()
     finally:
         os._exit(code)
+
+
+def solving_begins(*_arguments: object, **_options: object) -> NoReturn:
+    """Instead of an inversion."""
+    raise SystemExit(0)
 
 
 def save_images(folder: Path) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.findings import Finding
-from palpate.images.checks import check_headers, check_images, check_pair, check_segmentation
+from palpate.images.checks import check_headers, check_images, check_pair, check_segmentation, refuse_absent
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_label_image
 from palpate.images.segmentation import Segmentation, segment
@@ -78,7 +78,7 @@ def test_an_absent_organ_is_refused_by_name_label_and_image(number: int, where: 
     index = np.where(images[where].index == number, 0, images[where].index)
     images[where] = replace(images[where], index=index)
     with pytest.raises(InputDataError, match=rf"'{TISSUES[number].name}' \(label {number}, .*in '{where}'"):
-        check_pair(images["before"], images["after"])
+        refuse_absent(images["before"], (images["after"],))
 
 
 def test_a_known_tissue_may_be_absent() -> None:
