@@ -69,7 +69,8 @@ def _read(
         else:
             stored = read_stored(path, kind, image_format, limits, given)
         _check_affine(stored.affine, path)
-        values, affine = to_canonical(reduced(stored.values, path, kind=kind), stored.affine)
+        stored = reduced(stored, path, kind=kind)
+        values, affine = to_canonical(stored.values, stored.affine)
     except MemoryError as error:
         raise ResourceError(
             f"'{path}' does not fit into the memory of this machine; crop the image to the organs of the case"

@@ -28,7 +28,8 @@ class StoredImage:
 
     `names`: what the file itself says of its labels. `digests`: SHA-256 (hexadecimal) of each file as it was read, by
     its part in the image: "" the file itself, "voxels" the one beside it that holds the voxels, or a file's name in a
-    folder; empty when the reader does not say. `findings`: what the user should know of the reading.
+    folder; empty when the reader does not say. `findings`: what the user should know of the reading. `scale`: slope and
+    intercept by which the header makes `values` of the stored numbers.
     """
 
     values: NDArray[Any]
@@ -36,6 +37,7 @@ class StoredImage:
     names: tuple[NamedLabel, ...] = ()
     digests: Mapping[str, str] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
+    scale: tuple[float, float] = (1.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -10,17 +11,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
+from palpate.findings import Finding
 from palpate.images.named_labels import MAX_LABEL
+from palpate.images.readers.registry import StoredImage
 
 INTEGRAL_TOLERANCE = 1e-3  # resampling and 32-bit scaling leave 0.9999; more is a probability map or a grey image
 
 
-def reduced(values: NDArray[Any], path: Path, *, kind: str) -> NDArray[Any]:
-    """Values (n_1, n_2, n_3) as `label_values`, or as "intensities": float32 in the image's own unit (HU in a CT)."""
-    if kind == "labels":
-        return label_values(values, path)
-    with np.errstate(over="ignore"):
-        return values.astype(np.float32, copy=False)
+def reduced(image: StoredImage, path: Path, *, kind: str) -> StoredImage:
+    """The image with labels as `label_values`, or as "intensities": float32 in the image's own unit (HU in a CT)."""
+    if kind != "labels":
+        with np.errstate(over="ignore"):
+            return replace(image, values=image.values.astype(np.float32, copy=False))
+    slope, intercept = image.scale
+    scaled = f"its header makes them of what is stored by scl_slope {slope:g} and scl_inter {intercept:g}"
+    if image.scale == (1.0, 0.0):
+        return replace(image, values=label_values(image.values, path))
+    try:
+        labels = label_values(image.values, path)
+    except InputDataError as error:
+        raise InputDataError(f"{error}. These are scaled: {scaled}; labels are stored with 1 and 0") from error
+    if 0.0 < slope < 1.0:  # labels that were stored as parts of a range, by programs that scale whatever they save
+        return replace(image, values=labels)
+    text = f"the labels are scaled: {scaled}; set these to 1 and 0 if the stored numbers are the labels"
+    return replace(image, values=labels, findings=(*image.findings, Finding("scaled-labels", text)))
 
 
 def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
