@@ -37,7 +37,6 @@ from palpate.images.readers.voxel_stream import (
 MILLIMETRES = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}  # xyzt_units: unknown, metre, millimetre, micrometre
 HEADERS = {348: "Nifti1Header", 540: "Nifti2Header"}  # by nibabel, which is imported when an image comes
 MAGIC = {348: b"n+1\0", 540: b"n+2\0\r\n\032\n"}
-PAIR = (".hdr", ".img", ".hdr.gz", ".img.gz")
 VECTORS = {1005: "symmetric matrices", 1006: "displacements", 1007: "vectors", 2003: "colours", 2004: "colours"}
 LONGEST = 1.001  # of a quaternion, whose length is 1 but for rounding
 NO_ROOT = 1e-7  # nifti1_io.c: less than this of 1 - b^2 - c^2 - d^2 is rounding, and the turn is by 180 degrees
@@ -73,11 +72,6 @@ def nifti_content(path: Path, check: Callable[[Any, tuple[int, ...], Path], None
     `check` gets the header, the sizes of its axes and `path` before memory is taken, and raises where they are not what
     is read. Raises `InputDataError` for a file that is damaged, or is no NIfTI file in one piece.
     """
-    if path.name.lower().endswith(PAIR):
-        raise InputDataError(
-            f"'{path}' is one half of a .hdr/.img pair (NIfTI or Analyze), which is not read; convert both to one file"
-            " .nii.gz (3D Slicer, fslchfiletype, mri_convert), and see there that left and right are right"
-        )
     with opened(path) as file:
         zipped = file.peek(2)[:2] == b"\x1f\x8b"
         if zipped != path.name.lower().endswith(".gz"):

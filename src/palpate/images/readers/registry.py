@@ -20,6 +20,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import NamedLabel
 
 FOLDER = "/"  # no file's name ends so
+PAIR = (".hdr", ".img", ".hdr.gz", ".img.gz")
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +98,11 @@ def format_of(path: Path) -> ImageFormat:
     marked = marked_format(path)
     if marked is not None:
         return marked
-    known = ", ".join(sorted(set(_FORMATS) - {FOLDER}))
+    known, pair = ", ".join(sorted(set(_FORMATS) - {FOLDER})), path.name.lower().endswith(PAIR)
+    half = ", which is one half of a pair (NIfTI, Analyze; convert both to one .nii.gz)" if pair else ""
     raise InputDataError(
-        f"no reader for '{path}': the endings known are {known}; convert the image to one of these, or name a folder of"
-        " masks"
+        f"no reader for '{path}'{half}: the endings known are {known}; convert the image to one of these, or name a"
+        " folder of masks"
     )
 
 

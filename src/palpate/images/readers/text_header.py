@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -61,14 +62,13 @@ class StoredArray:
 
     def layers(self, path: Path, most: int | None = None) -> NDArray[Any]:
         """The images (n_layers, n_1, n_2, n_3); raises `InputDataError` for more than `most`, or several such axes."""
-        lists = [k for k in self.beside if self.values.shape[k] > 1]
-        squeezed = np.squeeze(self.values, axis=tuple(k for k in self.beside if k not in lists))
-        layers = np.moveaxis(squeezed, lists[0], 0) if lists else squeezed[None]
-        if len(lists) > 1 or len(layers) > (most or len(layers)):
+        layers = np.moveaxis(self.values, self.beside, range(len(self.beside)))
+        lists = [n for n in layers.shape[:-3] if n > 1]
+        if len(lists) > 1 or math.prod(lists) > (most or math.inf):
             sizes = list(self.values.shape)
             advice = "an image of three axes and one channel is needed; extract one volume (a time point, a channel)"
             raise refused(path, "sizes", sizes, advice)
-        return layers
+        return layers.reshape(-1, *layers.shape[-3:])
 
 
 def voxels_of(
