@@ -15,10 +15,11 @@ from palpate.findings import Finding
 from palpate.images.label_image import VoxelGrid, corners_apart
 from palpate.images.readers.registry import StoredImage
 from palpate.images.readers.text_header import numbers_in
-from palpate.images.readers.values import to_canonical
+from palpate.images.readers.values import check_affine, to_canonical
 from palpate.images.readers.voxel_stream import check_size
 
 SAME_PLACE = 0.01  # of a voxel, at the corners
+FARTHEST = 1e9  # mm, voxels
 # Keys of 3D Slicer (vtkMRMLSegmentationStorageNode): the first voxel's index in the reference image, whose grid is
 # among the parameters; files of before 2017 have an extent instead.
 OFFSET, GEOMETRY, EXTENT = (
@@ -57,6 +58,7 @@ def uncropped(image: StoredImage, keys: Mapping[str, str], grid: VoxelGrid | Non
             f"'{path}' was cropped by a 3D Slicer of before 2017, which wrote its place otherwise; open and save it in"
             " a newer one"
         )
+    check_affine(image.affine, path)
     reference = _reference(keys.get(GEOMETRY, ""), path)
     values, affine = to_canonical(image.values, image.affine)
     for part, whole in ((image, reference), (replace(image, values=values, affine=affine), grid)):
@@ -81,7 +83,7 @@ def _reference(parameters: str, path: Path) -> VoxelGrid | None:
     """The grid in "Reference image geometry|...|": index -> RAS mm by rows, then first and last index of each axis."""
     found = re.search(r"(?:^|&)Reference image geometry\|([^|&]*)", parameters)
     numbers = numbers_in(found[1].strip("; ").split(";")) if found else []
-    if len(numbers) != 22:
+    if len(numbers) != 22 or max(map(abs, numbers)) > FARTHEST:
         return None
     affine, extent = np.array(numbers[:16]).reshape(4, 4), np.array(numbers[16:]).reshape(3, 2)
     shape = tuple(int(n) for n in extent[:, 1] - extent[:, 0] + 1.0)

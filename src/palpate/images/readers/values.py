@@ -15,6 +15,7 @@ from palpate.findings import Finding
 from palpate.images.named_labels import MAX_LABEL
 from palpate.images.readers.registry import StoredImage
 
+MAX_SHEAR = 1e-3  # cosine between two axes; distances are computed on a rectangular grid
 INTEGRAL_TOLERANCE = 1e-3  # resampling and 32-bit scaling leave 0.9999; more is a probability map or a grey image
 
 
@@ -66,6 +67,27 @@ def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
             " is this a grey image? Name the label image (segmentation) instead, or renumber its labels"
         )
     return values.astype(np.uint8 if high <= 255 else np.uint16, copy=False)
+
+
+def check_affine(affine: NDArray[np.float64], path: Path) -> None:
+    """Refuse an affine (4, 4) that is not finite, flat or sheared: raises `InputDataError`."""
+    advice = "repair its header (sform or qform), or export the image again"
+    if not np.isfinite(affine).all():
+        raise InputDataError(f"the header of '{path}' places the voxels at {affine[:3].tolist()}, not finite; {advice}")
+    with np.errstate(all="ignore"):
+        spacing = np.linalg.norm(affine[:3, :3], axis=0)
+        volume, box = abs(np.linalg.det(affine[:3, :3])), np.prod(spacing)
+    if not spacing.min() > 0.0 or not np.isfinite(box) or volume < 1e-6 * box or volume < 1e-12:
+        raise InputDataError(
+            f"the affine in the header of '{path}', {affine[:3].tolist()}, flattens the image (voxel edges"
+            f" {spacing.tolist()} mm, volume {volume:.3g} mm^3); {advice}"
+        )
+    cosines = (affine[:3, :3] / spacing).T @ (affine[:3, :3] / spacing) - np.eye(3)
+    if np.abs(cosines).max() > MAX_SHEAR:
+        raise InputDataError(
+            f"the voxel axes of '{path}' are not at right angles (cosine {np.abs(cosines).max():.3g}, a tilted"
+            " gantry?); resample the image on a rectangular grid"
+        )
 
 
 def to_canonical(values: NDArray[Any], affine: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.float64]]:
