@@ -91,9 +91,7 @@ def _fields(lines: list[str], path: Path) -> dict[str, str]:
 def _affine(fields: Mapping[str, str], n: int, path: Path) -> NDArray[np.float64]:
     """Index -> RAS mm; ITK takes the world of every MetaImage for LPS, whatever AnatomicalOrientation says."""
     if fields.get("NDims") != str(n) or n < 3:
-        raise refused(
-            path, "NDims", fields.get("NDims"), f"three axes are needed, and DimSize has {n}: export it again"
-        )
+        raise refused(path, "NDims", fields.get("NDims"), f"three axes are needed, DimSize has {n}: export it again")
     rows = np.reshape(_numbers(fields, "TransformMatrix", path, n * n), (n, n))
     name = "ElementSpacing" if "ElementSpacing" in fields else "ElementSize"
     spacing = np.array(_numbers(fields, name, path, n))

@@ -130,9 +130,7 @@ def _place(fields: Mapping[str, Any], path: Path) -> tuple[NDArray[np.float64], 
         raise refused(path, "space", space, advice)
     vectors, origin = fields["space directions"], fields.get("space origin", np.zeros(n))
     if vectors.shape != (fields["dimension"], n) or origin.shape != (n,):
-        raise refused(
-            path, "space directions", vectors.tolist(), f"vectors of {n} numbers are needed, one for each size"
-        )
+        raise refused(path, "space directions", vectors.tolist(), f"vectors of {n} numbers, one a size, are needed")
     beside = np.isnan(vectors).all(axis=1) | (timed & ~vectors[:, :3].any(axis=1))
     if np.count_nonzero(~beside) != 3 or vectors[~beside, 3:].any():
         raise refused(path, "space directions", vectors.tolist(), "three axes are needed; extract one volume")

@@ -74,7 +74,7 @@ class StoredArray:
 def voxels_of(
     file: InputFile, path: Path, name: str | None, read: Callable[[InputFile], NDArray[Any]]
 ) -> tuple[NDArray[Any], dict[str, str]]:
-    """What `read` finds in the rest of the file at `path`, or in `name` beside it, and the digests of both."""
+    """The voxels (nx, ny, nz) that `read` finds in the rest of the file, or in `name` beside it, and the digests."""
     if name is None:
         return read(file), {"": file.sha256()}
     with open_input(_beside(path, name)) as other:
