@@ -257,6 +257,7 @@ def test_without_it_the_image_begins_where_its_reference_does_and_says_that_it_e
     completed = read_label_image(path, grid=grey)
     assert np.array_equal(completed.labels, whole())
     assert completed.findings == ()
+    assert np.array_equal(readers.read_label_image(path, grid=grey).labels, whole())  # by a process of its own
     shifted = VoxelGrid(FULL, WHOLE + np.pad([[0.3]], ((0, 3), (3, 0))))
     assert [finding.code for finding in read_label_image(path, grid=shifted).findings] == ["cropped"]
 
