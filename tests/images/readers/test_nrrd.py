@@ -129,7 +129,7 @@ PLAIN = "(0.5,0,0) (0,1,0) (0,0,2.5)"
             },
             bytes,
         ),
-        ({"type": "uchar\ntype: uchar"}, bytes),
+        ({"type": "uchar\nTYPE:   uchar "}, bytes),
         ({"kinds": "domain domain domain\nDICOM_0008:=a\nDICOM_0008:=a\n# sizes: 1 2 3"}, bytes),
         ({"space": "RAS\r", "Content": "colons: and = signs", "Sample_Units": '"HU"'}, bytes),
         ({"thicknesses": "nan nan 2.5", "old_min": "0", "measurement_frame": "(1,0,0) (0,1,0) (0,0,1)"}, bytes),

@@ -234,10 +234,13 @@ def text(first: NDArray[np.int64]) -> str:
     return " ".join(map(str, first))
 
 
-@pytest.mark.parametrize("begin", [0, 5])
-def test_a_cropped_segmentation_is_completed_by_the_reference_geometry_in_it(tmp_path: Path, begin: int) -> None:
+@pytest.mark.parametrize(("begin", "corner"), [(0, 1.0), (5, 1.0), (0, 0.0)])
+def test_a_cropped_segmentation_is_completed_by_the_reference_geometry_in_it(
+    tmp_path: Path, begin: int, corner: float
+) -> None:
+    place = np.diag([1.0, 1.0, 2.5, corner])
     box = whole()[2:6, 3:8, 4:10]
-    keys = {"ReferenceImageExtentOffset": text(FIRST), "ConversionParameters": geometry(begin=begin)}
+    keys = {"ReferenceImageExtentOffset": text(FIRST), "ConversionParameters": geometry(place, begin=begin)}
     image = read_label_image(cropped(tmp_path / "a.seg.nrrd", box, FIRST, **keys))
     assert np.array_equal(image.labels, whole())
     np.testing.assert_allclose(image.grid.affine, WHOLE, atol=1e-12)

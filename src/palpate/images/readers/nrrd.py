@@ -82,7 +82,7 @@ def _fields(lines: list[str], path: Path) -> dict[str, Any]:
         if name in VECTORS:  # without blanks in them; a bare nan, for an axis that is not in space, is none
             vectors = re.findall(r"\([^()]*\)|[^\s()]+", value.lower())
             value = " ".join("none" if each == "nan" else re.sub(r"\s+", "", each) for each in vectors)
-        plain.append(f"{name}{colon}{value}")
+        plain.append(f"{name}{colon}{value.strip()}")
     try:
         fields: dict[str, Any] = import_module("nrrd").read_header([lines[0], *dict.fromkeys(plain)])
     except Exception as error:  # pynrrd raises what numpy and Python raise

@@ -85,7 +85,7 @@ def _reference(parameters: str, path: Path) -> VoxelGrid | None:
     numbers = numbers_in(found[1].strip("; ").split(";")) if found else []
     if len(numbers) != 22 or max(map(abs, numbers)) > FARTHEST:
         return None
-    affine, extent = np.array(numbers[:16]).reshape(4, 4), np.array(numbers[16:]).reshape(3, 2)
+    affine, extent = np.vstack([np.reshape(numbers[:12], (3, 4)), np.eye(4)[3]]), np.reshape(numbers[16:], (3, 2))
     shape = tuple(int(n) for n in extent[:, 1] - extent[:, 0] + 1.0)
     if min(shape) < 1 or abs(np.linalg.det(affine[:3, :3])) < 1e-12:
         return None
