@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import base64
+import bz2
 import faulthandler
 import gzip
 import json
@@ -77,6 +78,7 @@ def image_targets() -> list[Target]:
     """One small label image in every form that a reader knows."""
     labels = np.random.default_rng(1).integers(0, 3, SHAPE, dtype=np.uint8)
     raw = labels.tobytes(order="F")
+    written = " ".join(map(str, raw)).encode()
     nifti1 = nibabel.Nifti1Image(labels, np.diag([1.0, 2.0, 3.0, 1.0])).to_bytes()
     nifti2 = nibabel.Nifti2Image(labels, np.diag([1.0, 2.0, 3.0, 1.0])).to_bytes()
     named = nibabel.Nifti1Image(labels, np.diag([1.0, 2.0, 3.0, 1.0]))
@@ -95,10 +97,13 @@ def image_targets() -> list[Target]:
             for ending, head, body in (
                 (".nrrd", nrrd("4 5 6", "raw"), raw),
                 (".nrrd", nrrd("4 5 6", "gzip"), zipped(raw)),
+                (".nrrd", nrrd("4 5 6", "bzip2"), bz2.compress(raw)),
+                (".nrrd", nrrd("4 5 6", "ascii"), written),
                 (".seg.nrrd", lists[:-1] + segments() + b"\n", layers),
                 (".nhdr", nrrd("4 5 6", "raw")[:-1] + b"data file: voxels.raw\n", b""),
                 (".mha", meta("False", "LOCAL"), raw),
                 (".mha", meta("True", "LOCAL"), zlib.compress(raw)),
+                (".mha", meta("False", "LOCAL", binary="False"), written),
                 (".mhd", meta("False", "voxels.raw"), b""),
             )
         ),
@@ -126,19 +131,22 @@ def nrrd(sizes: str, encoding: str, *, kinds: str = "domain domain domain", dire
 
 
 def segments() -> bytes:
-    """Keys of two segments in two layers."""
+    """Keys of two segments in two layers, cropped out of a larger image."""
     keys = [
         f"Segment{k}_{key}:={value}\n"
         for k, name in enumerate(("prostate", "bladder"))
         for key, value in (("ID", name), ("Name", name), ("Color", "0.5 0.2 1"), ("LabelValue", 1), ("Layer", k))
     ]
+    geometry = "-1;0;0;1;0;-2;0;2;0;0;3;-3;0;0;0;1;0;9;0;10;0;11;"
+    keys.append(f"Segmentation_ConversionParameters:=a|1|b&Reference image geometry|{geometry}|c&\n")
+    keys.append("Segmentation_ReferenceImageExtentOffset:=2 2 2\n")
     return "".join(keys).encode()
 
 
-def meta(compressed: str, data: str) -> bytes:
+def meta(compressed: str, data: str, *, binary: str = "True") -> bytes:
     """Header of a MetaImage file."""
     return (
-        f"ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\n"
+        f"ObjectType = Image\nNDims = 3\nBinaryData = {binary}\n0008|0060 = CT\nBinaryDataByteOrderMSB = False\n"
         f"CompressedData = {compressed}\n"
         "TransformMatrix = 1 0 0 0 1 0 0 0 1\nOffset = 1 2 3\nCenterOfRotation = 0 0 0\nAnatomicalOrientation = RAI\n"
         f"ElementSpacing = 1 2 3\nDimSize = 4 5 6\nElementType = MET_UCHAR\nElementDataFile = {data}\n"

@@ -38,6 +38,7 @@ Misleading = Literal[
     "islands",
     "sparse-contours",
     "cropped",
+    "scaled-labels",
     "rotation-undetermined",
     "rigid-unseen",
     "points-outside",

@@ -61,7 +61,26 @@ def write(path: Path, content: bytes) -> Path:
         ({"Offset": None, "Position": "20 -7 -3.5"}, bytes),
         ({"ElementSpacing": None, "ElementSize": "0.5 1 2.5"}, bytes),
         ({"HeaderSize": "-1"}, lambda content: b"abc" + content),
-        ({"HeaderSize": "3"}, lambda content: b"abc" + content),
+        ({"HeaderSize": "1000"}, lambda content: b"x" * (1000 - len(header(HeaderSize="1000"))) + content),
+        ({"BinaryData": "False"}, lambda content: " ".join(map(str, content)).encode()),
+        ({"0008|0060": "CT", "0018|0050": "2.0", "ITK original": "x", "Comment": "a = b: c"}, bytes),
+        (
+            {"ObjectSubType": "None", "AnatomicalOrientation": "LPS", "CenterOfRotation": "0 0 0", "Modality": "?"},
+            bytes,
+        ),
+        ({"Offset": "20 -7 -3.5\nPosition = 20.0 -7.0 -3.50\nOrigin = 20 -7 -3.5", "DistanceUnits": "mm"}, bytes),
+        ({"ElementType": "MET_UCHAR\nElementType = MET_UCHAR\nComment = one\nComment = two"}, bytes),
+        (
+            {
+                "NDims": "4",
+                "DimSize": "4 5 6 1",
+                "TransformMatrix": "-1 0 0 0 0 -1 0 0 0 0 1 0 0 0 0 1",
+                "Offset": "20 -7 -3.5 0",
+                "ElementSpacing": "0.5 1 2.5 1",
+            },
+            bytes,
+        ),
+        ({"ElementNumberOfChannels": "1", "ElementToIntensityFunctionSlope": "1", "ElementMax": "4"}, bytes),
     ],
 )
 def test_every_layout_gives_the_same_image(tmp_path: Path, changes, pack) -> None:
@@ -77,6 +96,22 @@ def test_every_number_type_gives_the_same_labels(tmp_path: Path, kind: str) -> N
     SimpleITK.WriteImage(image, str(tmp_path / "a.mha"), True)
     assert np.array_equal(read_label_image(tmp_path / "a.mha").labels, labels())
     assert read_intensities(tmp_path / "a.mha")[0].dtype == np.float32
+
+
+def test_other_signs_and_line_ends_are_read(tmp_path: Path) -> None:
+    for head in (header().replace(b" = ", b"="), header().replace(b" = ", b": "), header().replace(b"\n", b"\r\n")):
+        image = read_label_image(write(tmp_path / "a.mha", head + labels().tobytes(order="F")))
+        assert np.array_equal(image.labels, labels())
+
+
+def test_all_axes_are_there_for_those_who_can_use_them(tmp_path: Path) -> None:
+    vectors = np.random.default_rng(4).normal(size=(3, 4, 5, 6))
+    image = SimpleITK.GetImageFromArray(vectors.T, isVector=True)
+    image.SetOrigin((1.0, 2.0, 3.0))
+    SimpleITK.WriteImage(image, str(tmp_path / "a.mha"), True)
+    array = readers.metaimage.metaimage_content(tmp_path / "a.mha")
+    assert np.array_equal(array.layers(tmp_path / "a.mha"), vectors)
+    assert array.affine[:3, 3].tolist() == [-1.0, -2.0, 3.0]
 
 
 def test_big_endian_voxels_are_read(tmp_path: Path) -> None:
@@ -103,24 +138,39 @@ def test_data_outside_the_folder_are_not_followed(tmp_path: Path) -> None:
 BAD_HEADERS = {
     "no MetaImage": (b"\x89PNG\r\n\x1a\n", "does not begin"),
     "no data": (b"ObjectType = Image\n", "does not begin"),
-    "twice": (b"NDims = 3\n" + header(), "twice"),
-    "no sizes": (header(DimSize=None), "no 'dimsize'"),
+    "twice": (b"NDims = 2\n" + header(), "twice"),
+    "two places": (header(Position="1 2 3"), "twice"),
+    "units": (header(DistanceUnits="m"), "lengths in mm"),
+    "two channels": (header(ElementNumberOfChannels="2", DimSize="4 5 3"), "one channel"),
+    "two times": (
+        header(
+            NDims="4",
+            DimSize="2 5 6 2",
+            TransformMatrix="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1",
+            Offset="0 0 0 0",
+            ElementSpacing="1 1 1 1",
+        ),
+        "one channel",
+    ),
+    "no sizes": (header(DimSize=None), "DimSize: missing"),
+    "size no number": (header(DimSize="4 ² 6"), "positive counts"),
     "zero size": (header(DimSize="4 0 6"), "positive counts"),
     "huge": (header(DimSize="99999 99999 99999"), "more than the"),
     "sizes not data": (header(DimSize="4 5 60"), "cannot hold"),
-    "disagree": (header(NDims="2"), "disagree"),
+    "disagree": (header(NDims="2"), "DimSize has 3"),
     "two axes": (header(NDims="2", DimSize="4 5"), "three axes"),
-    "channels": (header(ElementNumberOfChannels="3"), "one channel"),
+    "channels": (header(ElementNumberOfChannels="x"), "positive counts"),
     "type": (header(ElementType="MET_STRING"), "only"),
-    "text": (header(BinaryData="False"), "only"),
+    "text": (header(BinaryData="False"), "cannot hold"),
     "flag": (header(CompressedData="maybe"), "not True or False"),
-    "no direction": (header(TransformMatrix=None), "left and right are unknown"),
+    "no direction": (header(TransformMatrix=None), "TransformMatrix: missing.*9 numbers"),
     "negative spacing": (header(ElementSpacing="1 -1 1"), "must be positive"),
-    "no spacing": (header(ElementSpacing=None), "scale is unknown"),
-    "NaN": (header(Offset="nan 0 0"), "numbers under"),
-    "too large": (header(TransformMatrix="1 0 0 1e308 1 0 0 0 1"), "numbers under"),
+    "no spacing": (header(ElementSpacing=None), "ElementSize: missing.*3 numbers"),
+    "NaN": (header(Offset="nan 0 0"), "3 numbers"),
+    "too large": (header(TransformMatrix="1 0 0 1e308 1 0 0 0 1"), "flattens"),
     "singular": (header(TransformMatrix="0 0 0 0 1 0 0 0 1"), "flattens"),
     "skip": (header(HeaderSize="-5"), "HeaderSize"),
+    "skip into the header": (header(HeaderSize="3"), "HeaderSize"),
     "skip packed": (header(HeaderSize="5", CompressedData="True"), "HeaderSize"),
     "no zlib": (header(CompressedData="True"), "damaged"),
     "control": (header(ElementType="\x1b[2J"), "only"),

@@ -165,6 +165,101 @@ def test_sform_or_qform_serves_alone_and_two_that_disagree_are_refused(tmp_path:
     np.testing.assert_allclose(read_label_image(tmp_path / "s.nii").grid.affine, AFFINE)
 
 
+def of_qform(path: Path, affine: NDArray[np.float64], *, sform: bool = False) -> Path:
+    """A file placed by its qform, with an sform beside it or none."""
+    image = nibabel.Nifti1Image(labels(), affine)
+    image.set_qform(affine, code=1)
+    image.set_sform(affine if sform else None, code=int(sform))
+    nibabel.save(image, path)
+    return path
+
+
+def patched(path: Path, *changes: Callable[[bytearray], None]) -> Path:
+    content = bytearray(path.read_bytes())
+    for change in changes:
+        change(content)
+    path.write_bytes(content)
+    return path
+
+
+QFAC, QUATERNION = 76, 256  # where pixdim[0] and quatern_b, c, d stand
+
+
+@pytest.mark.parametrize("sform", [False, True])
+@pytest.mark.parametrize(("qfac", "sign"), [(0.0, 1), (1.0, 1), (3.0, 1), (-1.0, -1)])
+def test_the_third_axis_turns_by_the_sign_of_qfac_and_zero_is_one(
+    tmp_path: Path, qfac: float, sign: int, sform: bool
+) -> None:
+    affine = oblique() @ np.diag([1.0, 1.0, sign, 1.0])
+    path = of_qform(tmp_path / "a.nii", affine, sform=sform)
+    there = read_label_image(patched(path, put("<f", QFAC, qfac)))
+    right = read_label_image(saved(tmp_path / "b.nii", labels(), affine))
+    assert np.array_equal(there.labels, right.labels)
+    np.testing.assert_allclose(there.grid.affine, right.grid.affine, atol=1e-5)
+
+
+@pytest.mark.parametrize("longer", [1e-7, 3e-7, 1e-5, 5e-4])
+def test_a_quaternion_longer_than_one_by_rounding_is_normalised(tmp_path: Path, longer: float) -> None:
+    half = np.sqrt(0.5) * (1.0 + longer)  # 180 degrees about the middle between two axes: b^2 + c^2 = 1
+    path = of_qform(tmp_path / "a.nii", np.diag([1.0, 2.0, 3.0, 1.0]))
+    image = read_label_image(patched(path, put("<3f", QUATERNION, half, half, 0.0)))
+    exact = nibabel.quaternions.quat2mat([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0]) @ np.diag([1.0, 2.0, 3.0])
+    found = image.grid.affine[:3, :3]
+    np.testing.assert_allclose(np.abs(found), np.abs(exact[:, np.argmax(np.abs(exact), axis=1)]), atol=1e-6)
+    np.testing.assert_allclose(np.sort(image.grid.spacing), [1.0, 2.0, 3.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: struct.pack_into("<3f", content, QUATERNION, 1.0, 1.0, 0.0),
+        lambda content: struct.pack_into("<f", content, QUATERNION, np.nan),
+        lambda content: struct.pack_into("<f", content, QFAC, np.nan),
+        lambda content: struct.pack_into("<f", content, QFAC + 4, 0.0),
+        lambda content: struct.pack_into("<f", content, QFAC + 8, -1.0),
+        lambda content: struct.pack_into("<f", content, QUATERNION + 12, np.inf),
+    ],
+)
+def test_a_damaged_qform_is_refused_alone_and_does_not_matter_beside_an_sform(tmp_path: Path, change) -> None:
+    with pytest.raises(InputDataError, match=r"qform in the header of '.*q\.nii' is damaged: .*; set an sform"):
+        read_label_image(patched(of_qform(tmp_path / "q.nii", oblique()), change))
+    image = read_label_image(patched(of_qform(tmp_path / "s.nii", oblique(), sform=True), change))
+    np.testing.assert_allclose(image.grid.affine, oblique(), atol=1e-5)
+
+
+def test_labels_that_the_header_scales_are_named_as_such(tmp_path: Path) -> None:
+    def scaled(slope: float, intercept: float = 0.0) -> Path:
+        return raw(tmp_path / "a.nii", change=put("<ff", 112, slope, intercept))
+
+    image = read_label_image(scaled(2.0))
+    assert np.array_equal(image.labels, 2 * labels())
+    assert [finding.code for finding in image.findings] == ["scaled-labels"]
+    assert "scl_slope 2 and scl_inter 0" in image.findings[0].message
+    for slope, intercept, words in ((0.3, 0.0, "not integers"), (1.0, -1.0, "from -1"), (2e4, 0.0, "0 to 80000")):
+        with pytest.raises(InputDataError, match=f"{words}.*scaled.*scl_slope {slope:g} and scl_inter {intercept:g}"):
+            read_label_image(scaled(slope, intercept))
+    for slope in (0.0, 1.0):
+        assert read_label_image(scaled(slope)).findings == ()
+    image = nibabel.Nifti1Image(labels().astype(np.float64), AFFINE)
+    image.header.set_data_dtype(np.int16)  # nibabel scales to the whole range
+    nibabel.save(image, tmp_path / "b.nii")
+    found = read_label_image(tmp_path / "b.nii")
+    assert np.array_equal(found.labels, labels())
+    assert found.findings == ()
+
+
+def test_vectors_are_there_for_those_who_can_use_them_and_are_no_image(tmp_path: Path) -> None:
+    vectors = np.random.default_rng(2).normal(size=(4, 5, 6, 1, 3)).astype(np.float32)
+    image = nibabel.Nifti1Image(vectors, AFFINE)
+    image.header.set_intent(1006)
+    nibabel.save(image, tmp_path / "a.nii.gz")
+    content = readers.nifti.nifti_content(tmp_path / "a.nii.gz", lambda *_: None)
+    assert np.array_equal(content.values, vectors)
+    assert np.array_equal(readers.nifti.nifti_affine(content.header, tmp_path), AFFINE)
+    with pytest.raises(InputDataError, match=r"displacements \(intent 1006\).*three axes"):
+        read_label_image(tmp_path / "a.nii.gz")
+
+
 @pytest.mark.parametrize("dtype", ["i1", "u2", "<i4", ">i4", ">f4", "f8", "i8", "u8"])
 def test_every_number_type_and_byte_order_gives_the_same_labels(tmp_path: Path, dtype: str) -> None:
     kind = np.dtype(dtype)
@@ -298,6 +393,8 @@ def test_files_that_are_no_images_are_refused_with_advice(tmp_path: Path) -> Non
         "sum.nii.gz": (good[:-8] + b"\0" * 8, "damaged"),
         "bits.nii.gz": (good[:40] + bytes(b ^ 0xFF for b in good[40:60]) + good[60:], "damaged|begin|header"),
         "a.png": (good, "no reader"),
+        "a.hdr": (good, "one half of a pair"),
+        "a.img.gz": (good, "one half of a pair"),
     }
     for name, (content, _) in contents.items():
         (tmp_path / name).write_bytes(content)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
 from functools import partial
 from pathlib import Path
@@ -99,6 +100,67 @@ def test_voxels_in_a_file_beside_the_header_begin_where_it_says(
     assert np.array_equal(read_label_image(path).labels, labels())
 
 
+LAYERED = {"dimension": "4", "sizes": "1 4 5 6", "kinds": "list domain domain domain"}
+TIMED = {"dimension": "4", "sizes": "4 5 6 1", "kinds": None}
+PLAIN = "(0.5,0,0) (0,1,0) (0,0,2.5)"
+
+
+@pytest.mark.parametrize(
+    ("changes", "pack"),
+    [
+        ({"encoding": "bzip2"}, bz2.compress),
+        ({"encoding": "bz2", "byte_skip": "3"}, lambda voxels: bz2.compress(b"abc" + voxels)),
+        ({"encoding": "GZIP", "byte_skip": "3"}, lambda voxels: gzip.compress(b"abc" + voxels)),
+        ({"encoding": "gz", "line_skip": "1"}, lambda voxels: b"a line\n" + gzip.compress(voxels)),
+        ({"encoding": "ascii"}, lambda voxels: " ".join(map(str, voxels)).encode()),
+        ({"encoding": "text", "type": "short"}, lambda voxels: "\n".join(map(str, voxels)).encode() + b"\n"),
+        ({"space_directions": "(0.5, 0, 0) (0, 1, 0)  (0,0, 2.5 )", "space_origin": "( -20, 7, -3.5)"}, bytes),
+        ({**LAYERED, "space_directions": f"none {PLAIN}"}, bytes),
+        ({**LAYERED, "space_directions": f"nan {PLAIN}"}, bytes),
+        ({**LAYERED, "space_directions": f"(nan,nan,nan) {PLAIN}"}, bytes),
+        ({**TIMED, "space_directions": f"{PLAIN} none"}, bytes),
+        (
+            {
+                **TIMED,
+                "space": "right-anterior-superior-time",
+                "space_directions": "(0.5,0,0,0) (0,1,0,0) (0,0,2.5,0) (0,0,0,3)",
+                "space_origin": "(-20,7,-3.5,9)",
+                "space_units": '"mm" "mm" "mm" "s"',
+            },
+            bytes,
+        ),
+        ({"type": "uchar\nTYPE:   uchar "}, bytes),
+        ({"kinds": "domain domain domain\nDICOM_0008:=a\nDICOM_0008:=a\n# sizes: 1 2 3"}, bytes),
+        ({"space": "RAS\r", "Content": "colons: and = signs", "Sample_Units": '"HU"'}, bytes),
+        ({"thicknesses": "nan nan 2.5", "old_min": "0", "measurement_frame": "(1,0,0) (0,1,0) (0,0,1)"}, bytes),
+    ],
+)
+def test_what_other_programs_write_is_read(tmp_path: Path, changes, pack) -> None:
+    image = read_label_image(write(tmp_path / "a.nrrd", header(**changes) + pack(labels().tobytes(order="F"))))
+    assert np.array_equal(image.labels, labels())
+    assert np.array_equal(image.grid.affine, AFFINE)
+
+
+def test_all_axes_are_there_for_those_who_can_use_them(tmp_path: Path) -> None:
+    vectors = np.random.default_rng(4).normal(size=(3, 4, 5, 6)).astype(np.float32)
+    changes = {"sizes": "3 4 5 6", "space_directions": f"none {PLAIN}", "kinds": "vector domain domain domain"}
+    content = header(dimension="4", type="float", endian="big", space_units='"cm" "cm" "cm"', **changes)
+    path = write(tmp_path / "a.nrrd", content + vectors.astype(">f4").tobytes(order="F"))
+    array, fields = readers.nrrd.nrrd_content(path)
+    assert np.array_equal(array.layers(path), vectors)
+    np.testing.assert_allclose(array.affine, np.diag([10.0, 10.0, 10.0, 1.0]) @ AFFINE)
+    assert fields["kinds"][0] == "vector"
+    with pytest.raises(InputDataError, match="three axes"):
+        read_label_image(path)
+
+
+def test_text_that_is_not_exact_in_its_type_is_refused(tmp_path: Path) -> None:
+    for word in ("300", "1.5", "x", "nan", ""):
+        body = " ".join([word, *["1"] * 119]).encode()
+        with pytest.raises(InputDataError, match=r"written as text|cannot hold"):
+            read_label_image(write(tmp_path / "a.nrrd", header(encoding="ascii") + body))
+
+
 def test_a_missing_origin_is_zero_and_units_are_honoured(tmp_path: Path) -> None:
     content = header(space_origin=None, space_units='"m" "m" "m"') + labels().tobytes(order="F")
     image = read_label_image(write(tmp_path / "a.nrrd", content))
@@ -138,37 +200,56 @@ def test_data_outside_the_folder_are_not_followed(tmp_path: Path) -> None:
 
 BAD_HEADERS = {
     "no mark": (b"NRRD0009\n" + header()[9:], "does not begin"),
-    "not a field": (header()[:-1] + b"nonsense\n\n", "has the line"),
-    "field twice": (header()[:-1] + b"sizes: 1 2 3\n\n", "twice"),
-    "no sizes": (header(sizes=None), "no 'sizes'"),
+    "not a field": (header()[:-1] + b"nonsense\n\n", "no NRRD header"),
+    "field twice": (header()[:-1] + b"sizes: 1 2 3\n\n", "Duplicate header field: sizes"),
+    "key twice": (header()[:-1] + b"Segment0_Name:=a\nSegment0_Name:=b\n\n", "Duplicate header field: Segment0_Name"),
+    "no sizes": (header(sizes=None), "sizes: missing"),
+    "no type": (header(type=None), "type: missing"),
+    "no encoding": (header(encoding=None), "encoding: missing"),
     "zero size": (header(sizes="4 0 6"), "positive counts"),
     "negative size": (header(sizes="4 -5 6"), "positive counts"),
-    "size no number": (header(sizes="4 x 6"), "positive counts"),
-    "size not plain": (header(sizes="4 ² 6"), "positive counts"),
+    "size no number": (header(sizes="4 x 6"), "no NRRD header"),
+    "size not plain": (header(sizes="4 ² 6"), "no NRRD header"),
+    "size no count": (header(sizes="4 0.5 6"), "positive counts"),
     "huge": (header(sizes="99999 99999 99999"), "more than the"),
     "overflow": (header(sizes="4294967296 4294967296 4294967296"), "more than the"),
     "sizes not data": (header(sizes="4 5 60"), "cannot hold"),
-    "dimension": (header(dimension="2"), "dimension"),
+    "dimension": (header(dimension="2"), "2 positive counts"),
     "two axes": (header(dimension="2", sizes="4 5", space_directions="(1,0,0) (0,1,0)"), "three axes"),
     "four axes": (
         header(dimension="4", sizes="2 2 5 6", space_directions="none (1,0,0) (0,1,0) (0,0,1)"),
         "three axes",
     ),
     "type": (header(type="block"), "type"),
-    "encoding": (header(encoding="bzip2"), "encoding"),
+    "encoding": (header(encoding="zip"), "encoding: zip"),
+    "no bzip2": (header(encoding="bzip2"), "damaged"),
+    "no text": (header(encoding="ascii"), "cannot hold"),
     "endian": (header(type="short"), "endian"),
     "no space": (header(space=None), "right, front and head"),
     "other space": (header(space="scanner-xyz"), "right, front and head"),
     "no directions": (header(space_directions=None, spacings="1 1 1"), "right, front and head"),
-    "NaN": (header(space_directions="(nan,0,0) (0,1,0) (0,0,1)"), "numbers under"),
-    "infinite": (header(space_origin="(inf,0,0)"), "numbers under"),
-    "too large": (header(space_directions="(1e300,0,0) (0,1e300,0) (0,0,1)"), "numbers under"),
+    "NaN": (header(space_directions="(nan,0,0) (0,1,0) (0,0,1)"), "not finite"),
+    "infinite": (header(space_origin="(inf,0,0)"), "not finite"),
+    "short origin": (header(space_origin="(1,0)"), "vectors of 3 numbers"),
+    "time leans": (
+        header(
+            dimension="4",
+            sizes="4 5 6 1",
+            space="LPST",
+            space_directions="(1,0,0,1) (0,1,0,0) (0,0,1,0) (0,0,0,1)",
+            space_origin="(0,0,0,0)",
+        ),
+        "three axes",
+    ),
+    "too large": (header(space_directions="(1e300,0,0) (0,1e300,0) (0,0,1)"), "flattens"),
     "flat": (header(space_directions="(1,0,0) (1,0,0) (0,0,1)"), "flattens"),
     "zero": (header(space_directions="(0,0,0) (0,1,0) (0,0,1)"), "flattens"),
     "units": (header(space_units='"mm" "mm" "inch"'), "space units"),
-    "skip": (header(byte_skip="999999999999"), "byte skip"),
-    "skip back": (header(encoding="gzip", byte_skip="-1"), "byte skip"),
-    "lines": (header(line_skip="1e9"), "line skip"),
+    "skip": (header(byte_skip="999999999999"), "999999999999 bytes before"),
+    "skip back": (header(encoding="gzip", byte_skip="-1"), "-1 bytes before"),
+    "skip behind": (header(byte_skip="-2"), "-2 bytes before"),
+    "lines": (header(line_skip="1e9"), "no NRRD header"),
+    "many lines": (header(line_skip="1000000000"), "line skip"),
     "long line": (header()[:-1] + b"#" + b"x" * 70_000 + b"\n\n", "does not end"),
     "endless": (header()[:-1] + (b"#" + b"x" * 60_000 + b"\n") * 80, "does not end"),
     "no gzip": (header(encoding="gzip"), "damaged"),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.images import readers
 from palpate.images.checks import check_pair
-from palpate.images.label_image import LabelImage
+from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role, Tissue
 
@@ -187,3 +187,112 @@ def test_names_from_a_header_are_cleaned_and_bad_colours_left_out(tmp_path: Path
     image = read_label_image(path)
     assert image.names == {1: "hip?[2J ?ßleft", 2: "segment 2", 3: "rectum"}
     assert image.colours == {3: "#336699"}
+
+
+FULL, FIRST = (9, 10, 11), np.array([2, 3, 4])  # the reference image's sizes, and where the segments begin in it
+WHOLE = np.diag([1.0, 1.0, 2.5, 1.0])
+
+
+def whole() -> NDArray[np.uint8]:
+    labels = np.zeros(FULL, dtype=np.uint8)
+    labels[2:6, 3:8, 4:10] = np.where(organs().any(axis=0), organs()[0] + 2 * organs()[1] + 3 * organs()[2], 0)
+    labels[2, 3:8, 4:10] = labels[5, 3:8, 4:10] = 1  # all six sides of the box are reached
+    labels[2, 3, 4] = 0
+    return labels
+
+
+def geometry(affine: NDArray[np.float64] = WHOLE, shape: tuple[int, ...] = FULL, begin: int = 0) -> str:
+    """As 3D Slicer writes it, RAS, with the extent beginning elsewhere if it likes."""
+    place = affine.copy()
+    place[:3, 3] -= begin * affine[:3, :3].sum(axis=1)
+    extent = [edge for n in shape for edge in (begin, begin + n - 1)]
+    numbers = ";".join(f"{number:.15g}" for number in [*place.ravel(), *extent])
+    return (
+        f"Collapse labelmaps|1|Merge. 1 = shared.&Reference image geometry|{numbers};|Image geometry.&Smoothing|0.5|x&"
+    )
+
+
+def cropped(path: Path, box: NDArray[np.uint8], first: NDArray[np.int64], **keys: str) -> Path:
+    lps = np.array([-1.0, -1.0, 1.0])
+    fields = {
+        "space": "left-posterior-superior",
+        "space directions": np.diag(lps * [1.0, 1.0, 2.5]),
+        "space origin": lps * (WHOLE[:3, :3] @ first),
+        "encoding": "gzip",
+        **{
+            f"Segment{k}_{key}": str(v)
+            for k in range(3)
+            for key, v in (("Name", SEGMENTS[k][0]), ("LabelValue", k + 1))
+        },
+        **{f"Segmentation_{key}": value for key, value in keys.items()},
+    }
+    nrrd.write(str(path), box, fields)
+    return path
+
+
+def text(first: NDArray[np.int64]) -> str:
+    return " ".join(map(str, first))
+
+
+@pytest.mark.parametrize(("begin", "corner"), [(0, 1.0), (5, 1.0), (0, 0.0)])
+def test_a_cropped_segmentation_is_completed_by_the_reference_geometry_in_it(
+    tmp_path: Path, begin: int, corner: float
+) -> None:
+    place = np.diag([1.0, 1.0, 2.5, corner])
+    box = whole()[2:6, 3:8, 4:10]
+    keys = {"ReferenceImageExtentOffset": text(FIRST), "ConversionParameters": geometry(place, begin=begin)}
+    image = read_label_image(cropped(tmp_path / "a.seg.nrrd", box, FIRST, **keys))
+    assert np.array_equal(image.labels, whole())
+    np.testing.assert_allclose(image.grid.affine, WHOLE, atol=1e-12)
+    assert image.findings == ()
+
+
+def test_without_it_the_image_begins_where_its_reference_does_and_says_that_it_ends_with_the_segments(
+    tmp_path: Path,
+) -> None:
+    box = whole()[2:6, 3:8, 4:10]
+    path = cropped(tmp_path / "a.seg.nrrd", box, FIRST, ReferenceImageExtentOffset=text(FIRST))
+    image = read_label_image(path)
+    assert np.array_equal(image.labels, whole()[:6, :8, :10])
+    np.testing.assert_allclose(image.grid.affine, WHOLE, atol=1e-12)
+    assert [finding.code for finding in image.findings] == ["cropped"]
+    grey = VoxelGrid(FULL, WHOLE)
+    completed = read_label_image(path, grid=grey)
+    assert np.array_equal(completed.labels, whole())
+    assert completed.findings == ()
+    assert np.array_equal(readers.read_label_image(path, grid=grey).labels, whole())  # by a process of its own
+    shifted = VoxelGrid(FULL, WHOLE + np.pad([[0.3]], ((0, 3), (3, 0))))
+    assert [finding.code for finding in read_label_image(path, grid=shifted).findings] == ["cropped"]
+
+
+@pytest.mark.parametrize(
+    ("box", "keys", "codes"),
+    [
+        (np.s_[:, :, :], {"ReferenceImageExtentOffset": "0 0 0"}, []),
+        (np.s_[:, :, :], {"ReferenceImageExtentOffset": "-3 0 0"}, []),  # segments went beyond the reference image
+        (np.s_[:, :, :], {"ConversionParameters": geometry(shape=(9, 10, 9))}, []),
+        (np.s_[:, :, :], {"ConversionParameters": geometry(WHOLE @ np.diag([2.0, 2.0, 2.0, 1.0]), (3, 3, 3))}, []),
+        (np.s_[2:6, 3:8, 4:10], {"ReferenceImageExtentOffset": "0 0 0"}, ["cropped"]),
+        (np.s_[2:6, 3:8, 4:10], {}, ["cropped"]),
+        (np.s_[2:6, 3:8, 4:10], {"ConversionParameters": geometry(np.diag([0.7, 1, 2.5, 1]))}, ["cropped"]),
+        (np.s_[2:6, 3:8, 4:10], {"ConversionParameters": "Reference image geometry|1;2;3|x&"}, ["cropped"]),
+        (np.s_[2:6, 3:8, :], {}, []),
+    ],
+)
+def test_what_can_be_known_of_a_crop_is_said(tmp_path: Path, box, keys: dict[str, str], codes: list[str]) -> None:
+    first = np.array([side.start or 0 for side in box])
+    image = read_label_image(cropped(tmp_path / "a.seg.nrrd", whole()[box], first, **keys))
+    assert [finding.code for finding in image.findings] == codes
+    assert np.array_equal(image.labels, whole()[box])
+
+
+def test_absurd_extents_are_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    box = whole()[2:6, 3:8, 4:10]
+    for keys in (
+        {"ReferenceImageExtentOffset": "99999 99999 99999"},
+        {"ConversionParameters": geometry(shape=(99999, 99999, 99999))},
+    ):
+        with pytest.raises(InputDataError, match="more than the"):
+            read_label_image(cropped(tmp_path / "a.seg.nrrd", box, FIRST, **keys))
+    with pytest.raises(InputDataError, match="before 2017"):
+        read_label_image(cropped(tmp_path / "a.seg.nrrd", box, FIRST, Extent="2 5 3 7 4 9"))
