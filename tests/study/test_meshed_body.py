@@ -18,7 +18,8 @@ from palpate.errors import ConfigurationError, GeometryError, InputDataError
 from palpate.export.fitted_model import fitted_model
 from palpate.mechanics.element import largest_strains
 from palpate.mechanics.loads import boundary_named
-from palpate.mesh.mesh_file import plane_faces, read_mesh_file
+from palpate.mesh.mesh_file import read_mesh_file
+from palpate.mesh.named_faces import plane_faces
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.phantoms.shapes import rotation_about
 from palpate.report.collect import collect
@@ -217,7 +218,7 @@ def test_a_body_that_makes_no_sense_is_refused(folder, change, words):
 @pytest.mark.parametrize("content", [b"", b"<VTKFile>", b"\x00" * 100])
 def test_a_mesh_that_is_none_is_refused(tmp_path, content):
     (tmp_path / "m.vtu").write_bytes(content)
-    with pytest.raises(InputDataError, match="no mesh that meshio reads"):
+    with pytest.raises(InputDataError, match="no mesh that is read"):
         read_mesh_file(tmp_path / "m.vtu")
 
 

@@ -236,7 +236,7 @@ def checked_case(
     before, after = pairs[0].before, pairs[0].after
     names = ("before", *(f"after[{i}]" for i in range(len(after))))
     organs = tuple(
-        OrganRow(t.name, str(t.role), tuple(round(image.volume(i) / 1000.0, 4) for image in (before, *after)))
+        OrganRow(t.name, str(t.role), tuple(round(volume / 1000.0, 4) for volume in pairs[0].volumes(i)))
         for i, t in enumerate(before.tissues)
         if t.meshed or pairs[0].mesh is None
     )
@@ -318,6 +318,7 @@ def _checked_pair(
     An organ that is absent is named, and left out of the other checks; the images are then not aligned.
     """
     if states.mesh is not None:  # its voxels only show it
+        problems.warn(states.findings, number)
         return states
     before, after = states.before, states.after
     names, where = later_names(len(after)), f"pair {number}: " if number > 1 else ""

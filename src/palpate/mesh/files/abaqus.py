@@ -1,0 +1,101 @@
+"""Meshes of Abaqus and CalculiX, .inp: elements with element sets, node sets and surfaces."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+
+from palpate.mesh.files.elements import Elements, Name, Numbers, places
+
+SOLID, SOLIDS = re.compile(r"(?:A|DC?|Q|CO)?C?3D(\d+)"), {4: "tetra", 6: "wedge", 8: "hexahedron", 10: "tetra10"}
+SHELL = re.compile(r"(?:CPS|CPE|M3D|R3D|SFM3D|S|STRI|DS)(?:(3)|65?)(?!D|\d)")
+HOLLOW = re.compile(r"CP|CG?AX|M3D|[RF][23]D|RAX|SFM|S[3-9]|STRI|DS|[TB][23]|PIPE|ELBOW|SPRING|DASH|MASS|ROT|CONN|GAP")
+FACES = {"S1": [1, 2, 3], "S2": [1, 4, 2], "S3": [2, 4, 3], "S4": [3, 4, 1]}
+MADE = ("INCLUDE", "SYSTEM", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "PARAMETER")
+FLAT = "write one part, all of whose nodes and elements are listed"
+Options, Rows = dict[str, str], list[list[str]]
+
+
+class _Sets(dict[str, Numbers]):
+    """Numbers by the name of their set, in capitals, for the case of letters does not count."""
+
+    def add(self, options: Options, of: str, numbers: Numbers) -> None:
+        """Some members, where the options name a set."""
+        if of in options:
+            name = options[of].upper()
+            self[name] = np.union1d(self.get(name, np.zeros(0, dtype=np.int64)), numbers)
+
+    def listed(self, rows: Rows, options: Options) -> Numbers:
+        """The members that rows list, by number or by set, or as first, last and step."""
+        if "GENERATE" in options:
+            steps = [([*map(int, row), 1])[:3] for row in rows]
+            return np.concatenate([np.arange(first, last + 1, step) for first, last, step in steps])
+        words = [word.upper() for row in rows for word in row]
+        return np.concatenate([self[w] if w in self else np.array([int(w)]) for w in words])
+
+    def placed(self, numbers: Numbers, of: str) -> dict[Name, list[Numbers]]:
+        """The members by their places in `numbers`."""
+        return {name: [places(numbers, own, of)] for name, own in self.items()}
+
+
+def read_abaqus(content: bytes, _: str | None) -> Elements:
+    """Elements with their sets and surfaces; raises `ValueError` for what is no such file, or is not listed in it."""
+    nodes, points, tables = list[int](), Rows(), list[tuple[str, Numbers]]()
+    known, surfaces, n_parts = {"NSET": _Sets(), "ELSET": _Sets()}, list[tuple[Options, Rows]](), 0
+    for keyword, options, rows in _keywords(content.decode(errors="replace")):
+        n_parts += keyword == "PART"
+        if keyword in MADE or n_parts > 1 or (keyword == "INSTANCE" and rows) or "SYSTEM" in options:
+            raise ValueError(f"it places nodes or elements by *{keyword}, which is not read: {FLAT}")
+        if keyword == "NODE":
+            nodes += (own := [int(row[0]) for row in rows])
+            points += [[*row[1:], "0", "0", "0"][:3] for row in rows]
+            known["NSET"].add(options, "NSET", np.array(own))
+        elif keyword == "ELEMENT":
+            tables.append(_table(options.get("TYPE", "").upper(), rows))
+            known["ELSET"].add(options, "ELSET", tables[-1][1][:, 0])
+        elif keyword in known:
+            known[keyword].add(options, keyword, known[keyword].listed(rows, options))
+        elif keyword == "SURFACE":
+            surfaces.append((options, rows))
+    at, numbers = np.array(nodes), np.concatenate([np.zeros(0, int), *(table[:, 0] for _, table in tables)])
+    if len(np.unique(at)) < len(at) or len(np.unique(numbers)) < len(numbers):
+        raise ValueError(f"two nodes or two elements have one number; {FLAT}")
+    tets = np.concatenate([np.zeros((0, 5), int), *(rows[:, :5] for kind, rows in tables if kind.startswith("tetra"))])
+    for options, row in ((options, row) for options, rows in surfaces for row in rows):
+        if options.get("TYPE", "").upper() == "NODE":
+            known["NSET"].add(options, "NAME", known["NSET"].listed([row[:1]], {}))
+        elif row[-1].upper() in FACES:
+            own = tets[places(tets[:, 0], known["ELSET"].listed([row[:1]], {}), "tetrahedra")]
+            new = 1 + numbers.max() + np.arange(len(own))
+            tables.append(("triangle", np.c_[new, own[:, FACES[row[-1].upper()]]]))
+            numbers = np.append(numbers, new)
+            known["ELSET"].add(options, "NAME", new)
+    blocks = [(kind, places(at, table[:, 1:], "nodes")) for kind, table in tables]
+    sets, point_sets = known["ELSET"].placed(numbers, "elements"), known["NSET"].placed(at, "nodes")
+    return Elements(np.array(points, dtype=float), blocks, sets, point_sets)
+
+
+def _keywords(text: str) -> Iterator[tuple[str, Options, Rows]]:
+    """Keyword, options and rows of words, one after the other; comments are left out."""
+    text = re.sub(r"(?m)^[ \t]*\*\*.*$", "", text.replace("\r\n", "\n"))
+    for block in re.split(r"(?m)^[ \t]*\*", text)[1:]:
+        head, *lines = re.sub(r"\A([^\n]*,)[ \t]*\n", r"\1", block).split("\n")
+        keyword, *options = (word.strip() for word in head.split(","))
+        pairs = (option.partition("=") for option in options)
+        rows = [[word.strip().strip('"') for word in line.split(",") if word.strip()] for line in lines]
+        yield keyword.upper(), {k.strip().upper(): v.strip().strip('"') for k, _, v in pairs}, [r for r in rows if r]
+
+
+def _table(name: str, rows: Rows) -> tuple[str, Numbers]:
+    """Kind, and number and nodes (n, 1 + n_nodes) of elements of a type; the number alone of what fills nothing."""
+    if solid := SOLID.match(name):
+        kind, n = SOLIDS.get(int(solid[1]), f"volume of {solid[1]} nodes"), int(solid[1])
+    elif shell := SHELL.match(name):
+        kind, n = ("triangle", 3) if shell[1] else ("triangle6", 6)
+    elif HOLLOW.match(name):
+        kind, n, rows = "line", 0, [row[:1] for row in rows]
+    else:
+        raise ValueError(f"its elements of the type '{name[:80]}' are not known; leave them out")
+    return kind, np.array([int(word) for row in rows for word in row]).reshape(-1, 1 + n)
