@@ -97,7 +97,7 @@ def _findings(file: MeshFile, case: Case) -> tuple[Finding, ...]:
         place = np.round(file.nodes[file.tets[file.piece == count.argmin()]].mean(axis=(0, 1)), 1).tolist()
         text = (
             f"the mesh has {len(count)} pieces that share no face, the largest of {count.max()} tetrahedra, the"
-            f" smallest of {count.min()} around {place} mm: no stress passes between them; join them if they are one body"
+            f" smallest of {count.min()} around {place} mm: no stress passes between them; join what is one body"
         )
         found.append(Finding("islands", text))
     return tuple(found)

@@ -29,15 +29,17 @@ class _Sets(dict[str, Numbers]):
 
     def listed(self, rows: Rows, options: Options) -> Numbers:
         """The members that rows list, by number or by set, or as first, last and step."""
+        parts, words = [np.zeros(0, dtype=np.int64)], [word.upper() for row in rows for word in row]
         if "GENERATE" in options:
-            steps = [([*map(int, row), 1])[:3] for row in rows]
-            return np.concatenate([np.arange(first, last + 1, step) for first, last, step in steps])
-        words = [word.upper() for row in rows for word in row]
-        return np.concatenate([self[w] if w in self else np.array([int(w)]) for w in words])
+            steps = [[*map(int, row), 1][:3] for row in rows]
+            return np.concatenate([*parts, *(np.arange(first, last + 1, step) for first, last, step in steps)])
+        if unknown := [word for word in words if word not in self and not word.isdecimal()]:
+            raise ValueError(f"it names a set '{unknown[0][:80]}' that it has not")
+        return np.concatenate([*parts, *(self[word] if word in self else np.array([int(word)]) for word in words)])
 
     def placed(self, numbers: Numbers, of: str) -> dict[Name, list[Numbers]]:
-        """The members by their places in `numbers`."""
-        return {name: [places(numbers, own, of)] for name, own in self.items()}
+        """The members by their places in `numbers`; what is not there is passed over, as Abaqus does."""
+        return {name: [places(numbers, np.intersect1d(own, numbers), of)] for name, own in self.items()}
 
 
 def read_abaqus(content: bytes, _: str | None) -> Elements:
@@ -51,7 +53,7 @@ def read_abaqus(content: bytes, _: str | None) -> Elements:
         if keyword == "NODE":
             nodes += (own := [int(row[0]) for row in rows])
             points += [[*row[1:], "0", "0", "0"][:3] for row in rows]
-            known["NSET"].add(options, "NSET", np.array(own))
+            known["NSET"].add(options, "NSET", np.array(own, dtype=np.int64))
         elif keyword == "ELEMENT":
             tables.append(_table(options.get("TYPE", "").upper(), rows))
             known["ELSET"].add(options, "ELSET", tables[-1][1][:, 0])
@@ -59,22 +61,37 @@ def read_abaqus(content: bytes, _: str | None) -> Elements:
             known[keyword].add(options, keyword, known[keyword].listed(rows, options))
         elif keyword == "SURFACE":
             surfaces.append((options, rows))
-    at, numbers = np.array(nodes), np.concatenate([np.zeros(0, int), *(table[:, 0] for _, table in tables)])
+    at, numbers = (
+        np.array(nodes, dtype=np.int64),
+        np.concatenate([np.zeros(0, int), *(table[:, 0] for _, table in tables)]),
+    )
     if len(np.unique(at)) < len(at) or len(np.unique(numbers)) < len(numbers):
         raise ValueError(f"two nodes or two elements have one number; {FLAT}")
-    tets = np.concatenate([np.zeros((0, 5), int), *(rows[:, :5] for kind, rows in tables if kind.startswith("tetra"))])
-    for options, row in ((options, row) for options, rows in surfaces for row in rows):
-        if options.get("TYPE", "").upper() == "NODE":
-            known["NSET"].add(options, "NAME", known["NSET"].listed([row[:1]], {}))
-        elif row[-1].upper() in FACES:
-            own = tets[places(tets[:, 0], known["ELSET"].listed([row[:1]], {}), "tetrahedra")]
-            new = 1 + numbers.max() + np.arange(len(own))
-            tables.append(("triangle", np.c_[new, own[:, FACES[row[-1].upper()]]]))
-            numbers = np.append(numbers, new)
-            known["ELSET"].add(options, "NAME", new)
+    numbers = _name_surfaces(surfaces, known["NSET"], known["ELSET"], tables, numbers)
     blocks = [(kind, places(at, table[:, 1:], "nodes")) for kind, table in tables]
     sets, point_sets = known["ELSET"].placed(numbers, "elements"), known["NSET"].placed(at, "nodes")
     return Elements(np.array(points, dtype=float), blocks, sets, point_sets)
+
+
+def _name_surfaces(
+    surfaces: list[tuple[Options, Rows]],
+    nodes: _Sets,
+    elements: _Sets,
+    tables: list[tuple[str, Numbers]],
+    numbers: Numbers,
+) -> Numbers:
+    """Sets of nodes, or of triangles that are added to the elements, of each surface; the numbers of all elements."""
+    tets = np.concatenate([np.zeros((0, 5), int), *(rows[:, :5] for kind, rows in tables if kind.startswith("tetra"))])
+    for options, row in ((options, row) for options, rows in surfaces for row in rows):
+        if options.get("TYPE", "").upper() == "NODE":
+            nodes.add(options, "NAME", nodes.listed([row[:1]], {}))
+        elif row[-1].upper() in FACES:
+            own = tets[places(tets[:, 0], elements.listed([row[:1]], {}), "tetrahedra")]
+            new = 1 + numbers.max() + np.arange(len(own))
+            tables.append(("triangle", np.c_[new, own[:, FACES[row[-1].upper()]]]))
+            numbers = np.append(numbers, new)
+            elements.add(options, "NAME", new)
+    return numbers
 
 
 def _keywords(text: str) -> Iterator[tuple[str, Options, Rows]]:
@@ -98,4 +115,4 @@ def _table(name: str, rows: Rows) -> tuple[str, Numbers]:
         kind, n, rows = "line", 0, [row[:1] for row in rows]
     else:
         raise ValueError(f"its elements of the type '{name[:80]}' are not known; leave them out")
-    return kind, np.array([int(word) for row in rows for word in row]).reshape(-1, 1 + n)
+    return kind, np.array([int(word) for row in rows for word in row], dtype=np.int64).reshape(-1, 1 + n)
