@@ -14,7 +14,7 @@ from scipy.io import netcdf_file
 
 from bodies import box_cells
 
-NUMBERS = {"SOFT": 1, "STIFF": 2, "BOTTOM": 11, "TOP": 12, "GRIP": 13}
+NUMBERS = {"SOFT": 1, "STIFF": 2, "BOTTOM": 11, "TOP": 12, "GRIP": 13, "INNER": 14}
 MIDDLES = {3: [(0, 1), (1, 2), (0, 2)], 4: [(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]}
 ABAQUS_FACES = [(0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3)]
 EXODUS_SIDES = [(0, 1, 3), (1, 2, 3), (0, 2, 3), (0, 1, 2)]

@@ -10,6 +10,7 @@ from bodies import box_cells
 from mesh_writers import COUNTED, NAMED, NUMBERS, abaqus, block, gmsh_4, second_order, shuffled
 from palpate.errors import InputDataError
 from palpate.mesh.mesh_file import read_mesh_file
+from palpate.mesh.tet_mesh import FACES
 
 
 def places(nodes, cells):
@@ -179,7 +180,7 @@ def cracked():
 def overlapping():
     """A block with one more tetrahedron on an inner face."""
     nodes, tets = box_cells((2, 2, 2), (10.0, 10.0, 10.0))
-    faces, count = np.unique(np.sort(tets[:, [0, 1, 2]], axis=1), axis=0, return_counts=True)
+    faces, count = np.unique(np.sort(tets[:, FACES].reshape(-1, 3), axis=1), axis=0, return_counts=True)
     inner = faces[count == 2][0]
     return np.concatenate([nodes, [[15.2, 5.3, 5.4]]]), np.concatenate([tets, [[*inner, len(nodes)]]])
 
