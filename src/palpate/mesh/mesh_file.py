@@ -18,11 +18,11 @@ from palpate.mesh.cutting import face_pieces
 from palpate.mesh.files.abaqus import read_abaqus
 from palpate.mesh.files.elements import MOST_BYTES, Elements, Name, Sets
 from palpate.mesh.files.exodus import read_exodus
-from palpate.mesh.files.others import read_by_meshio, read_gmsh
+from palpate.mesh.files.others import read_by_meshio, read_gmsh, read_med
 from palpate.mesh.tet_mesh import FACE_PAIRS
 from palpate.mesh.tetrahedralise import boundary_of
 
-READERS = {".msh": read_gmsh, ".inp": read_abaqus}
+READERS = {".msh": read_gmsh, ".inp": read_abaqus, ".med": read_med}
 READERS |= dict.fromkeys((".e", ".exo", ".ex2", ".exii", ".g", ".gen"), read_exodus)
 TETRAHEDRA, TRIANGLES = ("tetra", "tetra10"), ("triangle", "triangle6")
 HOLLOW = ("vertex", "line", "tri", "quad", "polygon", "VTK_LAGRANGE_C", "VTK_LAGRANGE_TR", "VTK_LAGRANGE_Q")
@@ -70,7 +70,11 @@ def read_mesh_file(path: Path, *, data: str | None = None) -> MeshFile:
     except PalpateError:
         raise
     except Exception as error:  # readers raise what their formats raise
-        words = str(error) if type(error) is ValueError else f"{type(error).__name__}: {error}"
+        words = str(error)
+        if type(error) is not ValueError:
+            words = (
+                f"its reader ends with {type(error).__name__} {error}; export it as .msh of version 4.1, or plain .vtu"
+            )
         raise InputDataError(f"'{path}' is no mesh that is read: {printable(words)}") from error
 
 

@@ -9,9 +9,14 @@ import numpy as np
 
 from palpate.mesh.files.elements import Elements, Name, Numbers, places
 
-SOLID, SOLIDS = re.compile(r"(?:A|DC?|Q|CO)?C?3D(\d+)"), {4: "tetra", 6: "wedge", 8: "hexahedron", 10: "tetra10"}
+SOLID, SOLIDS = (
+    re.compile(r"(?:A|DC?|Q|CO)?C?3D(\d+)"),
+    {4: "tetra", 6: "wedge", 8: "hexahedron", 10: "tetra10", 15: "wedge15", 20: "hexahedron20"},
+)
 SHELL = re.compile(r"(?:CPS|CPE|M3D|R3D|SFM3D|S|STRI|DS)(?:(3)|65?)(?!D|\d)")
-HOLLOW = re.compile(r"CP|CG?AX|M3D|[RF][23]D|RAX|SFM|S[3-9]|STRI|DS|[TB][23]|PIPE|ELBOW|SPRING|DASH|MASS|ROT|CONN|GAP")
+HOLLOW = re.compile(
+    r"CP|CG?AX|M3D|[RF][23]D|RAX|SFM|S[3-9]|STRI|DS|[TB][23]|PIPE|ELBOW|SPRING|DASH|MASS|ROT|CONN|GAP|D$|DCOUP"
+)
 FACES = {"S1": [1, 2, 3], "S2": [1, 4, 2], "S3": [2, 4, 3], "S4": [3, 4, 1]}
 MADE = ("INCLUDE", "SYSTEM", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "PARAMETER")
 FLAT = "write one part, all of whose nodes and elements are listed"
@@ -48,7 +53,12 @@ def read_abaqus(content: bytes, _: str | None) -> Elements:
     known, surfaces, n_parts = {"NSET": _Sets(), "ELSET": _Sets()}, list[tuple[Options, Rows]](), 0
     for keyword, options, rows in _keywords(content.decode(errors="replace")):
         n_parts += keyword == "PART"
-        if keyword in MADE or n_parts > 1 or (keyword == "INSTANCE" and rows) or "SYSTEM" in options:
+        if (
+            keyword in MADE
+            or n_parts > 1
+            or (keyword == "INSTANCE" and rows)
+            or (keyword == "NODE" and "SYSTEM" in options)
+        ):
             raise ValueError(f"it places nodes or elements by *{keyword}, which is not read: {FLAT}")
         if keyword == "NODE":
             nodes += (own := [int(row[0]) for row in rows])
@@ -86,7 +96,7 @@ def _name_surfaces(
         if options.get("TYPE", "").upper() == "NODE":
             nodes.add(options, "NAME", nodes.listed([row[:1]], {}))
         elif row[-1].upper() in FACES:
-            own = tets[places(tets[:, 0], elements.listed([row[:1]], {}), "tetrahedra")]
+            own = tets[np.isin(tets[:, 0], elements.listed([row[:1]], {}))]
             new = 1 + numbers.max() + np.arange(len(own))
             tables.append(("triangle", np.c_[new, own[:, FACES[row[-1].upper()]]]))
             numbers = np.append(numbers, new)
@@ -115,4 +125,7 @@ def _table(name: str, rows: Rows) -> tuple[str, Numbers]:
         kind, n, rows = "line", 0, [row[:1] for row in rows]
     else:
         raise ValueError(f"its elements of the type '{name[:80]}' are not known; leave them out")
-    return kind, np.array([int(word) for row in rows for word in row], dtype=np.int64).reshape(-1, 1 + n)
+    words = [int(word) for row in rows for word in row]
+    if len(words) % (1 + n):
+        raise ValueError(f"its elements of the type '{name[:80]}' have not {n} nodes each; export it again")
+    return kind, np.array(words, dtype=np.int64).reshape(-1, 1 + n)

@@ -18,7 +18,7 @@ from palpate.errors import ConfigurationError
 from palpate.mesh.files.elements import Elements, Name, Numbers
 
 GROUPS = ("tissue", "label", "region", "medit:ref", "gmsh:physical", "MaterialID", "material", "CellEntityIds")
-GROUPS += ("cell_tags", "tetgen:ref", "netgen:index", "nastran:ref", "avsucd:material", "ugrid:ref", "su2:tag")
+GROUPS += ("tetgen:ref", "netgen:index", "nastran:ref", "avsucd:material", "ugrid:ref", "su2:tag")
 DIMENSIONS = {"tetra": 3, "tetra10": 3, "triangle": 2, "triangle6": 2}
 Names = Callable[[int, int], Collection[Name]]  # the groups of elements of a dimension with a number
 
@@ -30,9 +30,15 @@ def read_by_meshio(path: Path, data: str | None) -> Elements:
     """
     mesh = _read(path)
     key = data or next((name for name in GROUPS if name in mesh.cell_data), None)
-    if key != "cell_tags":
-        return _elements(mesh, key, lambda _, number: (number,))
-    return _elements(mesh, key, lambda _, number: mesh.cell_tags.get(number, ()))  # families of MED
+    return _elements(mesh, key, lambda _, number: (number,))
+
+
+def read_med(content: bytes, data: str | None) -> Elements:
+    """The same of MED's, whose elements have the groups of their family."""
+    mesh = _read_copy(content, ".med")
+    if data is not None:
+        return _elements(mesh, data, lambda _, number: (number,))
+    return _elements(mesh, "cell_tags" if mesh.cell_tags else None, lambda _, number: mesh.cell_tags.get(number, ()))
 
 
 def read_gmsh(content: bytes, data: str | None) -> Elements:
@@ -43,10 +49,9 @@ def read_gmsh(content: bytes, data: str | None) -> Elements:
     named = re.findall(rb'(\d)\s+(-?\d+)\s+"([^"\n]*)"', content.partition(b"$EndPhysicalNames")[0])
     names = {(int(d), abs(int(tag))): text.decode(errors="replace") for d, tag, text in named}
     tags = _entities(content, binary=head[2] == b"1") if head[1] == b"4.1" else None
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "mesh.msh"
-        copy.write_bytes(content.replace(b"$Entities", b"$NotRead_", 1).replace(b"$EndEntities", b"$EndNotRead_", 1))
-        mesh = _read(copy)
+    mesh = _read_copy(
+        content.replace(b"$Entities", b"$NotRead_", 1).replace(b"$EndEntities", b"$EndNotRead_", 1), ".msh"
+    )
 
     def groups(dimension: int, number: int) -> Collection[Name]:
         """Numbers and names of the physical groups; of version 4.1 by the entity."""
@@ -57,6 +62,20 @@ def read_gmsh(content: bytes, data: str | None) -> Elements:
         return _elements(mesh, data, lambda _, number: (number,))
     key = "gmsh:physical" if tags is None else "gmsh:geometrical"
     return _elements(mesh, key if key in mesh.cell_data else None, groups)
+
+
+def _read_copy(content: bytes, ending: str) -> Any:
+    """What meshio reads of a copy of the file, in which MED's families without a group have an empty list of them."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"mesh{ending}"
+        path.write_bytes(content)
+        if ending == ".med":
+            with import_module("h5py").File(path, "r+") as file:
+                families = [own for mesh in file.get("FAS", {}).values() for of in mesh.values() for own in of.values()]
+                for family in (family for family in families if "GRO" not in family):
+                    family.create_group("GRO").attrs["NBR"] = 0
+                    family["GRO"]["NOM"] = np.zeros((0, 80), dtype=np.int8)
+        return _read(path)
 
 
 def _read(path: Path) -> Any:
