@@ -135,7 +135,7 @@ def _oriented(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> tuple[NDAr
         raise ValueError(f"{flat.sum()} of its tetrahedra have no volume, the first {where}; repair it, by Mmg or gmsh")
     shortest = np.full(len(nodes), np.inf)
     np.minimum.at(shortest, tets, edges.min(axis=1)[:, None])
-    near = cKDTree(nodes).query(nodes, k=2)[0][:, 1]
+    near = np.asarray(cKDTree(nodes).query(nodes, k=2)[0])[:, 1]
     apart = near < JOINED * shortest
     if apart.any():
         raise ValueError(

@@ -20,7 +20,8 @@ HOLLOW = re.compile(
 FACES = {"S1": [1, 2, 3], "S2": [1, 4, 2], "S3": [2, 4, 3], "S4": [3, 4, 1]}
 MADE = ("INCLUDE", "SYSTEM", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "PARAMETER")
 FLAT = "write one part, all of whose nodes and elements are listed"
-Options, Rows = dict[str, str], list[list[str]]
+Options = dict[str, str]
+Rows = list[list[str]]
 
 
 class _Sets(dict[str, Numbers]):
@@ -49,7 +50,7 @@ class _Sets(dict[str, Numbers]):
 
 def read_abaqus(content: bytes, _: str | None) -> Elements:
     """Elements with their sets and surfaces; raises `ValueError` for what is no such file, or is not listed in it."""
-    nodes, points, tables = list[int](), Rows(), list[tuple[str, Numbers]]()
+    nodes, points, tables = list[int](), list[list[str]](), list[tuple[str, Numbers]]()
     known, surfaces, n_parts = {"NSET": _Sets(), "ELSET": _Sets()}, list[tuple[Options, Rows]](), 0
     for keyword, options, rows in _keywords(content.decode(errors="replace")):
         n_parts += keyword == "PART"

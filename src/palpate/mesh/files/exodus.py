@@ -64,7 +64,8 @@ def _named(found: dict[str, Any], of: str) -> list[tuple[int, set[Name]]]:
 def _variables(content: bytes) -> tuple[dict[str, Any], dict[str, str]]:
     """Arrays by name, and the kind of elements by that of their array."""
     classic = content.startswith(b"CDF")
-    with netcdf_file(io.BytesIO(content)) if classic else import_module("h5py").File(io.BytesIO(content)) as file:
+    opened: Any = netcdf_file if classic else import_module("h5py").File
+    with opened(io.BytesIO(content)) as file:
         wanted = {name: data for name, data in getattr(file, "variables", file).items() if WANTED.match(name)}
         if sum(8.0 * np.prod(data.shape) for data in wanted.values()) > MOST_BYTES:
             raise ValueError(f"its arrays have over {MOST_BYTES / 2**30:.0f} GB")

@@ -17,8 +17,8 @@ import numpy as np
 from palpate.errors import ConfigurationError
 from palpate.mesh.files.elements import Elements, Name, Numbers
 
-GROUPS = ("tissue", "label", "region", "medit:ref", "gmsh:physical", "MaterialID", "material", "CellEntityIds")
-GROUPS += ("tetgen:ref", "netgen:index", "nastran:ref", "avsucd:material", "ugrid:ref", "su2:tag")
+GROUPS = ["tissue", "label", "region", "medit:ref", "gmsh:physical", "MaterialID", "material", "CellEntityIds"]
+GROUPS += ["tetgen:ref", "netgen:index", "nastran:ref", "avsucd:material", "ugrid:ref", "su2:tag"]
 DIMENSIONS = {"tetra": 3, "tetra10": 3, "triangle": 2, "triangle6": 2}
 Names = Callable[[int, int], Collection[Name]]  # the groups of elements of a dimension with a number
 
@@ -92,7 +92,7 @@ def _read(path: Path) -> Any:
 
 def _elements(mesh: Any, key: str | None, names: Names) -> Elements:
     """What meshio has read, with the groups that the cell data `key` number, the sets, and MED's groups of nodes."""
-    blocks = [(b.type, np.asarray(b.data) if b.type in DIMENSIONS else np.zeros((len(b.data), 0))) for b in mesh.cells]
+    blocks = [(b.type, np.asarray(b.data if b.type in DIMENSIONS else [()] * len(b.data), int)) for b in mesh.cells]
     firsts = np.cumsum([0, *(len(rows) for _, rows in blocks)])
     sets, point_sets = defaultdict[Name, list[Numbers]](list), defaultdict[Name, list[Numbers]](list)
     if key is not None and key not in mesh.cell_data:
