@@ -118,7 +118,9 @@ def test_a_force_and_a_field_tell_kilopascals(result):
     assert field.misfit == pytest.approx(1.0, abs=0.15)
     means = STRAIN * field.motions.rest * np.array([-RATIO, -RATIO, 1.0])
     assert np.abs(field.motions.observed - means).max() < 5 * 0.01
-    (drawn,) = collect(result).measured  # though no image is
+    shown = collect(result)
+    assert shown.images[0].volumes_ml[0] == pytest.approx(1e-3 * np.prod(SIZE))  # of elements, not of voxels
+    (drawn,) = shown.measured  # though no image is
     assert (drawn.name, drawn.points[0].total) == ("state 1", len(left))
     assert {surface.tissue for surface in drawn.outlines} == {0}  # the bar, not what its surfaces are called
 
