@@ -162,6 +162,7 @@ def test_a_deck_is_read_as_abaqus_reads_it(tmp_path):
         ("*ELEMENT, TYPE=C3D5\n900, 1, 2, 3, 4, 5", "it has 1 volume of 5 nodes"),
         ("*ELEMENT, TYPE=XYZ\n900, 1, 2", "'XYZ' are not known"),
         ("*ELEMENT, TYPE=C3D8\n900, 1, 2, 3, 4, 5, 6, 7, 8", "beside 72 tetrahedra it has 1 hexahedron"),
+        ("*ELSET, ELSET=A, GENERATE\n1, 1000000000000", "over 1e.07 members"),
         ("*ELSET, ELSET=A\nB", "names a set 'B'"),
     ],
 )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from palpate.errors import InputDataError, PalpateError
+from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.input_file import open_input
 from palpate.images.named_labels import printable
 from palpate.mesh.cutting import face_pieces
@@ -67,19 +67,19 @@ def read_mesh_file(path: Path, *, data: str | None = None) -> MeshFile:
     try:
         read = reader(content, data) if reader else read_by_meshio(path, data)
         return _sound(read, digest)
-    except PalpateError:
+    except InputDataError as error:
+        raise InputDataError(f"'{path}' is no mesh that is read: {error}") from error
+    except ConfigurationError:
         raise
-    except Exception as error:  # readers raise what their formats raise
-        words = str(error)
-        if type(error) is not ValueError:
-            words = (
-                f"its reader ends with {type(error).__name__} {error}; export it as .msh of version 4.1, or plain .vtu"
-            )
-        raise InputDataError(f"'{path}' is no mesh that is read: {printable(words)}") from error
+    except Exception as error:  # libraries raise what they like
+        raise InputDataError(
+            f"'{path}' is no mesh that is read: {type(error).__name__} {printable(str(error))[:200]}; export it as .msh"
+            " of version 4.1, or as plain .vtu"
+        ) from error
 
 
 def _sound(read: Elements, digest: str) -> MeshFile:
-    """The mesh, its nodes numbered anew, with all that speaks of them; `ValueError` for what is no sound one."""
+    """The mesh, its nodes numbered anew, with all that speaks of them; `InputDataError` for what is no sound one."""
     tets, of_tets = read.of(TETRAHEDRA, 4)
     triangles, of_triangles = read.of(TRIANGLES, 3)
     count = Counter[str]()
@@ -89,11 +89,13 @@ def _sound(read: Elements, digest: str) -> MeshFile:
         f"{n} {kind}" for kind, n in count.items() if kind not in TETRAHEDRA and not kind.startswith(HOLLOW)
     )
     if others and len(tets):
-        raise ValueError(f"beside {len(tets)} tetrahedra it has {others}: split these into tetrahedra of 4 or 10 nodes")
+        raise InputDataError(
+            f"beside {len(tets)} tetrahedra it has {others}: split these into tetrahedra of 4 or 10 nodes"
+        )
     if not len(tets):
-        raise ValueError(f"it holds {dict(count)} and no tetrahedra; export a volume mesh of 4 or 10 nodes a cell")
+        raise InputDataError(f"it holds {dict(count)} and no tetrahedra; export a volume mesh of 4 or 10 nodes a cell")
     if tets.min() < 0 or tets.max() >= len(read.points) or read.points.shape[1] != 3:
-        raise ValueError(f"its tetrahedra name nodes that it has not ({len(read.points)} nodes); export it again")
+        raise InputDataError(f"its tetrahedra name nodes that it has not ({len(read.points)} nodes); export it again")
     _, first, same = np.unique(np.sort(tets, axis=1), axis=0, return_index=True, return_inverse=True)
     kept = np.sort(first)  # gmsh writes what is in two groups twice
     number = np.full((2, sum(count.values())), -1)
@@ -109,7 +111,7 @@ def _sound(read: Elements, digest: str) -> MeshFile:
         groups[1] = np.arange(len(tets))
     shown = {name: new[triangles[own]] for name, own in _members(read.sets, number[1]).items() if len(own)}
     surfaces = {name: np.unique(np.sort(rows, axis=1), axis=0) for name, rows in shown.items()}
-    faces = boundary_of(tets)
+    faces = boundary_of(tets) if read.point_sets else tets[:0, :3]
     for name, own in _members(read.point_sets, new).items():
         surfaces.setdefault(name, faces[np.isin(faces, own).all(axis=1)])
     return MeshFile(nodes, tets, piece, groups, surfaces, read.about, digest)
@@ -123,28 +125,32 @@ def _members(sets: Sets, number: NDArray[np.int64]) -> dict[Name, NDArray[np.int
 
 
 def _oriented(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Tetrahedra of positive volume, and the piece of each; `ValueError` for flat ones, cracks and overlaps."""
+    """Tetrahedra of positive volume, and the piece of each; `InputDataError` for flat ones, cracks and overlaps."""
     if not np.isfinite(nodes).all():
-        raise ValueError("a node has a coordinate that is no number; export it again")
+        raise InputDataError("a node has a coordinate that is no number; export it again")
     corners = nodes[tets]
     volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
     edges = np.linalg.norm(corners[:, FACE_PAIRS[:, 0]] - corners[:, FACE_PAIRS[:, 1]], axis=2)
     flat = np.abs(volumes) <= SLIVER * edges.max(axis=1) ** 3
     if flat.any():
         where = _place(corners[flat].mean(axis=1))
-        raise ValueError(f"{flat.sum()} of its tetrahedra have no volume, the first {where}; repair it, by Mmg or gmsh")
+        raise InputDataError(
+            f"{flat.sum()} of its tetrahedra have no volume, the first {where}; repair it, by Mmg or gmsh"
+        )
     shortest = np.full(len(nodes), np.inf)
     np.minimum.at(shortest, tets, edges.min(axis=1)[:, None])
     near = np.asarray(cKDTree(nodes).query(nodes, k=2)[0])[:, 1]
     apart = near < JOINED * shortest
     if apart.any():
-        raise ValueError(
+        raise InputDataError(
             f"{apart.sum()} of its nodes lie on another one that they are not joined to, as at a crack, the first"
             f" {_place(nodes[apart])}, {near[apart][0]:.2g} mm apart; merge such nodes (gmsh: Coherence Mesh)"
         )
     piece, with_face = face_pieces(tets)
     if with_face.max() > 2:
-        raise ValueError(f"{(with_face > 2).sum()} faces belong to over two tetrahedra, which overlap: mesh it anew")
+        raise InputDataError(
+            f"{(with_face > 2).sum()} faces belong to over two tetrahedra, which overlap: mesh it anew"
+        )
     return np.where(volumes[:, None] < 0.0, tets[:, [0, 2, 1, 3]], tets), piece
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from palpate.errors import InputDataError
 from palpate.mesh.files.elements import Elements, Name, Numbers, places
 
 SOLID, SOLIDS = (
@@ -19,6 +20,7 @@ HOLLOW = re.compile(
 )
 FACES = {"S1": [1, 2, 3], "S2": [1, 4, 2], "S3": [2, 4, 3], "S4": [3, 4, 1]}
 MADE = ("INCLUDE", "SYSTEM", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "PARAMETER")
+MOST_MEMBERS = 10**7
 FLAT = "write one part, all of whose nodes and elements are listed"
 Options = dict[str, str]
 Rows = list[list[str]]
@@ -37,10 +39,14 @@ class _Sets(dict[str, Numbers]):
         """The members that rows list, by number or by set, or as first, last and step."""
         parts, words = [np.zeros(0, dtype=np.int64)], [word.upper() for row in rows for word in row]
         if "GENERATE" in options:
-            steps = [[*map(int, row), 1][:3] for row in rows]
-            return np.concatenate([*parts, *(np.arange(first, last + 1, step) for first, last, step in steps)])
+            steps = [range(first, last + 1, step) for first, last, step in ([*map(int, row), 1][:3] for row in rows)]
+            if sum(map(len, steps)) > MOST_MEMBERS:
+                raise InputDataError(
+                    f"a set of over {MOST_MEMBERS:.0e} members is generated; write its last number right"
+                )
+            return np.concatenate([*parts, *map(np.array, steps)]).astype(np.int64)
         if unknown := [word for word in words if word not in self and not word.isdecimal()]:
-            raise ValueError(f"it names a set '{unknown[0][:80]}' that it has not")
+            raise InputDataError(f"it names a set '{unknown[0][:80]}' that it has not")
         return np.concatenate([*parts, *(self[word] if word in self else np.array([int(word)]) for word in words)])
 
     def placed(self, numbers: Numbers, of: str) -> dict[Name, list[Numbers]]:
@@ -49,18 +55,14 @@ class _Sets(dict[str, Numbers]):
 
 
 def read_abaqus(content: bytes, _: str | None) -> Elements:
-    """Elements with their sets and surfaces; raises `ValueError` for what is no such file, or is not listed in it."""
+    """Elements with their sets and surfaces; raises `InputDataError` for what is none, or is not listed in it."""
     nodes, points, tables = list[int](), list[list[str]](), list[tuple[str, Numbers]]()
-    known, surfaces, n_parts = {"NSET": _Sets(), "ELSET": _Sets()}, list[tuple[Options, Rows]](), 0
+    known, n_parts = {"NSET": _Sets(), "ELSET": _Sets()}, 0
     for keyword, options, rows in _keywords(content.decode(errors="replace")):
         n_parts += keyword == "PART"
-        if (
-            keyword in MADE
-            or n_parts > 1
-            or (keyword == "INSTANCE" and rows)
-            or (keyword == "NODE" and "SYSTEM" in options)
-        ):
-            raise ValueError(f"it places nodes or elements by *{keyword}, which is not read: {FLAT}")
+        moved = (keyword == "INSTANCE" and rows) or (keyword == "NODE" and "SYSTEM" in options)
+        if keyword in MADE or n_parts > 1 or moved:
+            raise InputDataError(f"it places nodes or elements by *{keyword}, which is not read: {FLAT}")
         if keyword == "NODE":
             nodes += (own := [int(row[0]) for row in rows])
             points += [[*row[1:], "0", "0", "0"][:3] for row in rows]
@@ -71,38 +73,27 @@ def read_abaqus(content: bytes, _: str | None) -> Elements:
         elif keyword in known:
             known[keyword].add(options, keyword, known[keyword].listed(rows, options))
         elif keyword == "SURFACE":
-            surfaces.append((options, rows))
-    at, numbers = (
-        np.array(nodes, dtype=np.int64),
-        np.concatenate([np.zeros(0, int), *(table[:, 0] for _, table in tables)]),
-    )
+            _surface(options, rows, known, tables)
+    at = np.array(nodes, dtype=np.int64)
+    numbers = np.concatenate([at[:0], *(table[:, 0] for _, table in tables)])
     if len(np.unique(at)) < len(at) or len(np.unique(numbers)) < len(numbers):
-        raise ValueError(f"two nodes or two elements have one number; {FLAT}")
-    numbers = _name_surfaces(surfaces, known["NSET"], known["ELSET"], tables, numbers)
+        raise InputDataError(f"two nodes or two elements have one number; {FLAT}")
     blocks = [(kind, places(at, table[:, 1:], "nodes")) for kind, table in tables]
     sets, point_sets = known["ELSET"].placed(numbers, "elements"), known["NSET"].placed(at, "nodes")
     return Elements(np.array(points, dtype=float), blocks, sets, point_sets)
 
 
-def _name_surfaces(
-    surfaces: list[tuple[Options, Rows]],
-    nodes: _Sets,
-    elements: _Sets,
-    tables: list[tuple[str, Numbers]],
-    numbers: Numbers,
-) -> Numbers:
-    """Sets of nodes, or of triangles that are added to the elements, of each surface; the numbers of all elements."""
-    tets = np.concatenate([np.zeros((0, 5), int), *(rows[:, :5] for kind, rows in tables if kind.startswith("tetra"))])
-    for options, row in ((options, row) for options, rows in surfaces for row in rows):
-        if options.get("TYPE", "").upper() == "NODE":
-            nodes.add(options, "NAME", nodes.listed([row[:1]], {}))
-        elif row[-1].upper() in FACES:
-            own = tets[np.isin(tets[:, 0], elements.listed([row[:1]], {}))]
-            new = 1 + numbers.max() + np.arange(len(own))
-            tables.append(("triangle", np.c_[new, own[:, FACES[row[-1].upper()]]]))
-            numbers = np.append(numbers, new)
-            elements.add(options, "NAME", new)
-    return numbers
+def _surface(options: Options, rows: Rows, known: Mapping[str, _Sets], tables: list[tuple[str, Numbers]]) -> None:
+    """A surface as a set of nodes, or of triangles, which join the elements under numbers below 0."""
+    if options.get("TYPE", "").upper() == "NODE":
+        known["NSET"].add(options, "NAME", known["NSET"].listed([row[:1] for row in rows], {}))
+    tets = [table[:, :5] for kind, table in tables if kind.startswith("tetra")]
+    for face, corners in FACES.items():
+        wanted = known["ELSET"].listed([row[:1] for row in rows if row[-1].upper() == face], {})
+        own = np.concatenate([np.zeros((0, 5), int), *(table[np.isin(table[:, 0], wanted)] for table in tets)])
+        numbers = -1 - sum(len(table) for _, table in tables) - np.arange(len(own))
+        tables.append(("triangle", np.c_[numbers, own[:, corners]]))
+        known["ELSET"].add(options, "NAME", numbers)
 
 
 def _keywords(text: str) -> Iterator[tuple[str, Options, Rows]]:
@@ -125,8 +116,8 @@ def _table(name: str, rows: Rows) -> tuple[str, Numbers]:
     elif HOLLOW.match(name):
         kind, n, rows = "line", 0, [row[:1] for row in rows]
     else:
-        raise ValueError(f"its elements of the type '{name[:80]}' are not known; leave them out")
+        raise InputDataError(f"its elements of the type '{name[:80]}' are not known; leave them out")
     words = [int(word) for row in rows for word in row]
     if len(words) % (1 + n):
-        raise ValueError(f"its elements of the type '{name[:80]}' have not {n} nodes each; export it again")
+        raise InputDataError(f"its elements of the type '{name[:80]}' have not {n} nodes each; export it again")
     return kind, np.array(words, dtype=np.int64).reshape(-1, 1 + n)

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.errors import InputDataError
+
 MOST_BYTES = 4 * 2**30
 Name = int | str
 Numbers = NDArray[np.int64]
@@ -38,9 +40,9 @@ class Elements:
 
 
 def places(numbers: Numbers, wanted: Numbers, of: str) -> Numbers:
-    """Where each of the `wanted` (...) stands in `numbers` (n,), from 0; raises `ValueError` where one does not."""
+    """Where each of the `wanted` (...) stands in `numbers` (n,), from 0; raises `InputDataError` where one does not."""
     missing = np.setdiff1d(wanted, numbers)
     if len(missing):
-        raise ValueError(f"it names {len(missing)} {of} that it has not, the first of the number {missing[0]}")
+        raise InputDataError(f"it names {len(missing)} {of} that it has not, the first of the number {missing[0]}")
     order = np.argsort(numbers, kind="stable")
     return np.asarray(order[np.searchsorted(numbers, wanted, sorter=order)])

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.io import netcdf_file
 
+from palpate.errors import InputDataError
 from palpate.mesh.files.elements import MOST_BYTES, Elements, Name, Numbers
 
 WANTED = re.compile(r"coord[xyz]?$|connect\d+$|(eb|ss|ns)_(prop1|names)$|(elem|side)_ss\d+$|node_ns\d+$")
@@ -20,7 +21,7 @@ HOLLOW = ("TRI", "SHE", "QUA", "BAR", "BEA", "TRU", "SPH", "CIR", "EDG", "POI", 
 
 
 def read_exodus(content: bytes, _: str | None) -> Elements:
-    """Elements with the blocks, side sets and node sets; raises `ValueError` for what is no such file."""
+    """Elements with the blocks, side sets and node sets; raises `InputDataError` for what is no such file."""
     found, kinds = _variables(content)
     axes = [found[f"coord{axis}"] for axis in "xyz"] if "coordx" in found else found["coord"]
     blocks, first = list[tuple[str, Numbers]](), 0
@@ -68,7 +69,7 @@ def _variables(content: bytes) -> tuple[dict[str, Any], dict[str, str]]:
     with opened(io.BytesIO(content)) as file:
         wanted = {name: data for name, data in getattr(file, "variables", file).items() if WANTED.match(name)}
         if sum(8.0 * np.prod(data.shape) for data in wanted.values()) > MOST_BYTES:
-            raise ValueError(f"its arrays have over {MOST_BYTES / 2**30:.0f} GB")
+            raise InputDataError(f"its arrays have over {MOST_BYTES / 2**30:.0f} GB")
         attributes = {name: data if classic else data.attrs for name, data in wanted.items()}
         arrays = {name: np.array(data[:]) for name, data in wanted.items()}
         kinds = {n: getattr(a, "elem_type", b"") if classic else a.get("elem_type", b"") for n, a in attributes.items()}

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.errors import ConfigurationError
+from palpate.errors import ConfigurationError, InputDataError
 from palpate.mesh.files.elements import Elements, Name, Numbers
 
 GROUPS = ["tissue", "label", "region", "medit:ref", "gmsh:physical", "MaterialID", "material", "CellEntityIds"]
@@ -26,7 +26,7 @@ Names = Callable[[int, int], Collection[Name]]  # the groups of elements of a di
 def read_by_meshio(path: Path, data: str | None) -> Elements:
     """Elements with the groups that cell data number (by default the first of the usual names), and named sets.
 
-    Raises `ValueError` for what is no such file, `ConfigurationError` where meshio is not installed.
+    Raises `InputDataError` for what is no such file, `ConfigurationError` where meshio is not installed.
     """
     mesh = _read(path)
     key = data or next((name for name in GROUPS if name in mesh.cell_data), None)
@@ -45,7 +45,7 @@ def read_gmsh(content: bytes, data: str | None) -> Elements:
     """The same of gmsh's: all groups of an element, of which meshio gives the first, and none where any has none."""
     head = re.search(rb"\$MeshFormat\s+(2|4\.1)\S*\s+([01])", content)
     if head is None or b"$PartitionedEntities" in content:
-        raise ValueError("it is partitioned, or of a version that is not read; save it whole, as version 4.1")
+        raise InputDataError("it is partitioned, or of a version that is not read; save it whole, as version 4.1")
     named = re.findall(rb'(\d)\s+(-?\d+)\s+"([^"\n]*)"', content.partition(b"$EndPhysicalNames")[0])
     names = {(int(d), abs(int(tag))): text.decode(errors="replace") for d, tag, text in named}
     tags = _entities(content, binary=head[2] == b"1") if head[1] == b"4.1" else None
@@ -87,7 +87,9 @@ def _read(path: Path) -> Any:
         with contextlib.redirect_stdout(io.StringIO()) as said:  # it prints why it does not read a file
             return meshio.read(path)
     except SystemExit as error:  # and ends the program
-        raise ValueError(f"meshio does not read it: {said.getvalue().strip()}; export it as .vtu or .msh") from error
+        raise InputDataError(
+            f"meshio does not read it: {said.getvalue().strip()}; export it as .vtu or .msh"
+        ) from error
 
 
 def _elements(mesh: Any, key: str | None, names: Names) -> Elements:
@@ -96,11 +98,11 @@ def _elements(mesh: Any, key: str | None, names: Names) -> Elements:
     firsts = np.cumsum([0, *(len(rows) for _, rows in blocks)])
     sets, point_sets = defaultdict[Name, list[Numbers]](list), defaultdict[Name, list[Numbers]](list)
     if key is not None and key not in mesh.cell_data:
-        raise ValueError(f"it has no cell data '{key}'; tissue_data may name one of {sorted(mesh.cell_data)}")
+        raise InputDataError(f"it has no cell data '{key}'; tissue_data may name one of {sorted(mesh.cell_data)}")
     for first, (kind, _), data in zip(firsts, blocks, mesh.cell_data.get(key, ()), strict=False):
         values = np.unique(data) if kind in DIMENSIONS else np.zeros(0)
         if not np.array_equal(values, np.rint(values)):
-            raise ValueError(f"its cell data '{key}' are no whole numbers; name others in tissue_data")
+            raise InputDataError(f"its cell data '{key}' are no whole numbers; name others in tissue_data")
         for value in values:
             for name in names(DIMENSIONS[kind], int(value)):
                 sets[name].append(first + np.flatnonzero(data == value))
