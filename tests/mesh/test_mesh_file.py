@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import h5py
 import meshio
 import numpy as np
 import pytest
 
 from bodies import box_cells
-from mesh_writers import COUNTED, NAMED, NUMBERS, abaqus, block, gmsh_4, second_order, shuffled
+from mesh_writers import COUNTED, NAMED, NUMBERS, abaqus, block, exodus, gmsh_4, second_order, shuffled
 from palpate.errors import InputDataError
 from palpate.mesh.mesh_file import read_mesh_file
 from palpate.mesh.tet_mesh import FACES
@@ -77,6 +78,17 @@ def test_groups_with_a_name_are_found_by_number_too(tmp_path, name):
     for called, number in NUMBERS.items():
         for of in (file.groups, file.surfaces):
             assert np.array_equal(of.get(called), of.get(number)) or called not in of
+
+
+def test_an_empty_block_of_exodus_is_none(tmp_path):
+    """Blocks that a program keeps without an element have a number and a name, and no array."""
+    exodus(tmp_path / "m.exo", block())
+    with h5py.File(tmp_path / "m.exo", "r+") as file:
+        numbers, names = file["eb_prop1"][()], file["eb_names"][()]
+        del file["eb_prop1"], file["eb_names"]
+        file["eb_prop1"], file["eb_names"] = np.append(numbers, 9).astype("i4"), np.concatenate([names, names[:1]])
+    file = read_mesh_file(tmp_path / "m.exo")
+    assert {name: len(own) for name, own in file.groups.items()} == {"SOFT": 32, 1: 32, "STIFF": 40, 2: 40}
 
 
 def test_elements_that_gmsh_saves_without_a_group_are_in_none(tmp_path):

@@ -86,7 +86,7 @@ def _sound(read: Elements, digest: str) -> MeshFile:
     for kind, rows in read.blocks:
         count[kind] += len(rows)
     others = ", ".join(
-        f"{n} {kind}" for kind, n in count.items() if kind not in TETRAHEDRA and not kind.startswith(HOLLOW)
+        f"{n} {kind}" for kind, n in count.items() if n and kind not in TETRAHEDRA and not kind.startswith(HOLLOW)
     )
     if others and len(tets):
         raise InputDataError(

@@ -108,13 +108,13 @@ def _keywords(text: str) -> Iterator[tuple[str, Options, Rows]]:
 
 
 def _table(name: str, rows: Rows) -> tuple[str, Numbers]:
-    """Kind, and number and nodes (n, 1 + n_nodes) of elements of a type; the number alone of what fills nothing."""
+    """Kind, and number and nodes (n, 1 + n_nodes) of elements of a type; nothing of what fills nothing."""
     if solid := SOLID.match(name):
         kind, n = SOLIDS.get(int(solid[1]), f"volume of {solid[1]} nodes"), int(solid[1])
     elif shell := SHELL.match(name):
         kind, n = ("triangle", 3) if shell[1] else ("triangle6", 6)
     elif HOLLOW.match(name):
-        kind, n, rows = "line", 0, [row[:1] for row in rows]
+        kind, n, rows = "line", 0, []
     else:
         raise InputDataError(f"its elements of the type '{name[:80]}' are not known; leave them out")
     words = [int(word) for row in rows for word in row]
