@@ -68,11 +68,10 @@ def input_images(pairs: tuple[ImagePair, ...]) -> tuple[InputImage, ...]:
         digests = [pair.result.provenance.inputs.get(name, "") for name in keys]
         for later, (name, image, sha256) in enumerate(zip((pair.before, *pair.after), images, digests, strict=True)):
             x, y, z = (float(edge) for edge in image.grid.spacing)
-            volume = image.grid.voxel_volume * np.bincount(image.index.ravel(), minlength=len(image.tissues))
+            of, weights = image.index.ravel(), np.full(image.index.size, image.grid.voxel_volume)
             if pair.result.case.body is not None:  # its voxels only show the mesh
-                mesh = pair.result.space.mesh
-                volume = np.bincount(mesh.region, mesh.volumes, minlength=len(image.tissues))
-            volumes = tuple((volume / 1000.0).tolist())
+                of, weights = pair.result.space.mesh.region, pair.result.space.mesh.volumes
+            volumes = tuple((np.bincount(of, weights, minlength=len(image.tissues)) / 1000.0).tolist())
             found.append(InputImage(name, number, later > 0, image.grid.shape, (x, y, z), volumes, sha256))
     return tuple(found)
 
