@@ -68,10 +68,10 @@ def input_images(pairs: tuple[ImagePair, ...]) -> tuple[InputImage, ...]:
         digests = [pair.result.provenance.inputs.get(name, "") for name in keys]
         for later, (name, image, sha256) in enumerate(zip((pair.before, *pair.after), images, digests, strict=True)):
             x, y, z = (float(edge) for edge in image.grid.spacing)
-            of, weights = image.index.ravel(), np.full(image.index.size, image.grid.voxel_volume)
-            if pair.result.case.body is not None:  # its voxels only show the mesh
-                of, weights = pair.result.space.mesh.region, pair.result.space.mesh.volumes
-            volumes = tuple((np.bincount(of, weights, minlength=len(image.tissues)) / 1000.0).tolist())
+            mesh = pair.result.space.mesh if pair.result.case.body is not None else None  # voxels only show it
+            counts = image.grid.voxel_volume * np.bincount(image.index.ravel(), minlength=len(image.tissues))
+            sums = mesh and np.bincount(mesh.region, mesh.volumes, minlength=len(image.tissues))
+            volumes = tuple(((counts if sums is None else sums) / 1000.0).tolist())
             found.append(InputImage(name, number, later > 0, image.grid.shape, (x, y, z), volumes, sha256))
     return tuple(found)
 
