@@ -42,6 +42,21 @@ def test_polynomials_of_the_elements_order_are_met(mesh, element, power):
     np.testing.assert_allclose(point_interpolation(space, places) @ values, expected, rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.parametrize(("out", "inside"), [(1e-12, True), (2e-4, True), (2e-3, False)])
+def test_a_point_outside_by_rounding_alone_is_inside(mesh, out, inside):
+    """By less than a thousandth of an element; what lies further lies outside. A linear field is met there."""
+    rng = np.random.default_rng(3)
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    points = rng.uniform(low, high, (60, 3))
+    axis, end = np.arange(60) % 3, np.arange(60) % 2
+    points[np.arange(60), axis] = np.where(end, high[axis] + out, low[axis] - out)  # of cells of a third of a mm
+    places = located(mesh, points)
+    assert np.all(places.inside == inside)
+    space, slope = lagrange_space(mesh, "P1"), rng.standard_normal(3)
+    found = point_interpolation(space, places.of(places.inside)) @ (space.points @ slope)
+    np.testing.assert_allclose(found, (points @ slope)[places.inside], atol=1e-9)
+
+
 def test_every_node_lies_in_its_own_mesh(mesh):
     assert located(mesh, mesh.nodes).inside.all()
 

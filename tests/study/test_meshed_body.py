@@ -13,17 +13,22 @@ import pytest
 
 import palpate
 from bodies import box_cells
+from mesh_writers import abaqus, block, gmsh_2, gmsh_4, numbered
 from palpate.cli import main
 from palpate.errors import ConfigurationError, GeometryError, InputDataError
 from palpate.export.fitted_model import fitted_model
 from palpate.mechanics.element import largest_strains
 from palpate.mechanics.loads import boundary_named
-from palpate.mesh.mesh_file import plane_faces, read_mesh_file
+from palpate.mesh.mesh_file import read_mesh_file
+from palpate.mesh.named_faces import plane_faces
+from palpate.mesh.space import lagrange_space
+from palpate.mesh.surface import triangle_normals
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.phantoms.shapes import rotation_about
 from palpate.report.collect import collect
 from palpate.study.body import inverse_problem, make_body
 from palpate.study.case_file import read_case
+from palpate.study.case_loads import case_loads
 from palpate.study.check import check_case
 from palpate.study.cost import expected_cost
 from palpate.study.read import read_states
@@ -113,7 +118,9 @@ def test_a_force_and_a_field_tell_kilopascals(result):
     assert field.misfit == pytest.approx(1.0, abs=0.15)
     means = STRAIN * field.motions.rest * np.array([-RATIO, -RATIO, 1.0])
     assert np.abs(field.motions.observed - means).max() < 5 * 0.01
-    (drawn,) = collect(result).measured  # though no image is
+    shown = collect(result)
+    assert shown.images[0].volumes_ml[0] == pytest.approx(1e-3 * np.prod(SIZE))  # of elements, not of voxels
+    (drawn,) = shown.measured  # though no image is
     assert (drawn.name, drawn.points[0].total) == ("state 1", len(left))
     assert {surface.tissue for surface in drawn.outlines} == {0}  # the bar, not what its surfaces are called
 
@@ -217,7 +224,7 @@ def test_a_body_that_makes_no_sense_is_refused(folder, change, words):
 @pytest.mark.parametrize("content", [b"", b"<VTKFile>", b"\x00" * 100])
 def test_a_mesh_that_is_none_is_refused(tmp_path, content):
     (tmp_path / "m.vtu").write_bytes(content)
-    with pytest.raises(InputDataError, match="no mesh that meshio reads"):
+    with pytest.raises(InputDataError, match="no mesh that is read"):
         read_mesh_file(tmp_path / "m.vtu")
 
 
@@ -376,6 +383,190 @@ def test_exports_repeat_each_states_motion_and_loads(folder, tmp_path):
     assert pulls == pytest.approx([1e3 * FORCE_N, -0.5e3 * FORCE_N], rel=1e-6)  # mN
     palpate.export(result, tmp_path / "febio", format="febio", linear=True)
     assert len(ET.parse(tmp_path / "febio" / "palpate.feb").findall("Step/step")) == 2
+
+
+GROUPS = """
+[body]
+mesh = "m.msh"
+
+[[surfaces]]
+name = "hand"
+where = "GRIP"
+
+[[surfaces]]
+name = "plate"
+where = "TOP"
+boundary = "free"
+
+[tissues.low]
+label = "SOFT"
+role = "estimate"
+
+[tissues.high]
+label = 2
+role = "estimate"
+
+[[loads]]
+kind = "traction"
+surface = "plate"
+traction_kpa = [0.0, 0.0, 1.0]
+
+[[data]]
+kind = "displacement-field"
+file = "field.csv"
+sd_mm = 0.01
+"""
+
+
+@pytest.fixture
+def grouped(folder, tmp_path):
+    """Writes the block of two materials whose grip is half of its top, and a case about it, and reads that."""
+
+    def read(text=GROUPS, of=None, write=gmsh_4, name="m.msh"):
+        write(tmp_path / name, of or block())
+        (tmp_path / "field.csv").write_text((folder / "field.csv").read_text())
+        (tmp_path / "case.toml").write_text(text.replace("m.msh", name))
+        return read_case(tmp_path / "case.toml")
+
+    return read
+
+
+@pytest.mark.parametrize("write", [gmsh_2, gmsh_4])
+def test_a_triangle_in_two_groups_counts_in_both(grouped, write):
+    case = grouped(write=write)
+    mesh = read_states(case).mesh
+    normals = {name: triangle_normals(mesh.nodes, boundary_named(mesh, name)).sum(axis=0) for name in ("hand", "plate")}
+    assert normals["hand"] == pytest.approx([0.0, 0.0, 200.0])
+    assert normals["plate"] == pytest.approx([0.0, 0.0, 400.0])
+    held = mesh.boundary[mesh.beyond == mesh.tissue_index("hand")]  # the first gives what holds it
+    assert triangle_normals(mesh.nodes, held).sum(axis=0) == pytest.approx([0.0, 0.0, 200.0])
+    (load,) = case_loads(case, lagrange_space(mesh, "P2"), 1)
+    assert load.forces(np.zeros(0)).reshape(-1, 3).sum(axis=0) == pytest.approx([0.0, 0.0, 400.0])  # mN
+
+
+def test_volumes_are_those_of_the_elements(grouped):
+    report = check_case(grouped(), [], progress=lambda _: None)
+    volumes = {row.tissue: row.volumes_ml for row in report.organs}
+    of = block()
+    expected = {
+        name: np.abs(np.linalg.det(of.nodes[of.tets[own, 1:]] - of.nodes[of.tets[own, :1]])).sum() / 6e3
+        for name, own in of.groups.items()
+    }
+    assert volumes == {
+        "low": (pytest.approx(expected["SOFT"], abs=1e-4),),
+        "high": (pytest.approx(expected["STIFF"], abs=1e-4),),
+    }
+    assert sum(expected.values()) == pytest.approx(12.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        (("label = 2", "label = 3"), ConfigurationError, "'high' has no tetrahedron: the mesh has no group 3"),
+        (
+            ('label = "SOFT"', 'label = "SOFTER"'),
+            ConfigurationError,
+            r"no group .SOFTER.; .* did you mean 'SOFT'",
+        ),
+        (("label = 2", "label = [1, 2]"), ConfigurationError, r"\d+ tetrahedra are in groups of 'low' and 'high'"),
+        (
+            ("label = 2", 'label = "STIFF"\nrole = "estimate"\n[tissues.rest]\nlabel = "remaining"'),
+            ConfigurationError,
+            "'rest' has no tetrahedron: the others have all",
+        ),
+        (
+            ('[tissues.high]\nlabel = 2\nrole = "estimate"\n', ""),
+            ConfigurationError,
+            r"has \d+ of the tetrahedra, which are in the group\(s\) \['2', 'STIFF'\]",
+        ),
+        (
+            ('name = "hand"\nwhere = "GRIP"', 'name = "hand"\nwhere = "INNER"'),
+            GeometryError,
+            r"\d+ of the \d+ triangles of the group 'INNER' are no faces of the mesh's boundary",
+        ),
+        (('where = "GRIP"', 'where = "TOP"\nboundary = "free"'), GeometryError, "all faces of the surface 'plate'"),
+        (('where = "TOP"\nboundary = "free"', 'where = "BOTH"'), ConfigurationError, "no surface 'BOTH'"),
+    ],
+)
+def test_groups_that_do_not_fit_the_body_are_refused_by_name(grouped, change, error, words):
+    of = block()
+    inner = of.tets[:3, [0, 1, 2]]
+    of = replace(of, triangles=np.concatenate([of.triangles, inner]))
+    of.surfaces["INNER"] = np.append(of.surfaces["GRIP"], len(of.triangles) - 1 - np.arange(3))
+    assert change[0] in GROUPS
+    with pytest.raises(error, match=words):
+        read_states(grouped(GROUPS.replace(*change), of))
+
+
+@pytest.mark.parametrize(
+    ("plate", "hand", "words"),
+    [
+        ("TOP", "GRIP", "all faces of the surface 'hand' belong to surfaces that are named before"),
+        (
+            "GRIP",
+            "TOP",
+            "4 of the 8 faces of the surface 'hand' would be free, as they belong to 'plate'",
+        ),
+    ],
+)
+def test_a_held_surface_does_not_become_free_by_the_order_of_names(grouped, plate, hand, words):
+    first = f'[[surfaces]]\nname = "plate"\nwhere = "{plate}"\nboundary = "free"\n'
+    second = f'[[surfaces]]\nname = "hand"\nwhere = "{hand}"\n'
+    head, tail = GROUPS.split("[[surfaces]]", maxsplit=1)[0], GROUPS[GROUPS.index("[tissues.low]") :]
+    with pytest.raises(GeometryError, match=words):
+        read_states(grouped(head + first + second + tail))
+
+
+def test_names_of_a_deck_are_its_names_whatever_their_letters(grouped):
+    text = GROUPS.replace("label = 2", 'label = "Stiff"').replace('"SOFT"', '"soft"').replace('"TOP"', '"top"')
+    states = read_states(grouped(text, write=abaqus, name="m.inp"))
+    assert states.mesh.volumes.sum() == pytest.approx(12e3)
+    with pytest.raises(ConfigurationError, match="the mesh has no group 2; its groups"):
+        read_states(grouped(GROUPS, write=abaqus, name="m.inp"))
+
+
+def test_a_mesh_in_metres_is_named_with_the_factor(grouped):
+    of = block()
+    text = GROUPS.replace('where = "GRIP"', 'where = "z_min"')
+    small = replace(of, nodes=1e-3 * of.nodes)
+    with pytest.raises(
+        InputDataError, match=r"0\.03 mm long; if it was written in metres, multiply its coordinates by 1000"
+    ):
+        read_states(grouped(text, small))
+    assert [f.code for f in read_states(grouped(GROUPS, small)).findings] == ["units"]
+    assert read_states(grouped(GROUPS, of)).findings == ()
+    large = read_states(grouped(GROUPS, replace(of, nodes=1e3 * of.nodes))).findings
+    assert "micrometres, multiply its coordinates by 0.001" in large[0].message
+
+
+def test_pieces_that_share_no_face_are_named(grouped):
+    of = block()
+    n = len(of.nodes)
+    far = replace(
+        of,
+        nodes=np.concatenate([of.nodes, of.nodes[of.tets[0]] + 100.0]),
+        tets=np.concatenate([of.tets, [[n, n + 1, n + 2, n + 3]]]),
+        groups={**of.groups, "STIFF": np.append(of.groups["STIFF"], len(of.tets))},
+    )
+    case = grouped(GROUPS, far)
+    (finding,) = (
+        problem for problem in check_case(case, [], progress=lambda _: None).problems if problem.code == "islands"
+    )
+    assert "2 pieces that share no face, the largest of 72 tetrahedra, the smallest of 1 around" in finding.message
+
+
+def test_cell_data_of_another_name_is_told(grouped):
+    def parts(path, of):
+        numbered(path, of)
+        mesh = meshio.read(path)
+        mesh.cell_data["PartId"] = mesh.cell_data.pop("tissue")
+        meshio.write(path, mesh)
+
+    text = GROUPS.replace('"SOFT"', "1").replace('"GRIP"', '"13"').replace('"TOP"', '"12"')
+    with pytest.raises(ConfigurationError, match=r"no group 2; .*tissue_data may name one, are \['PartId'\]"):
+        read_states(grouped(text, write=parts, name="m.vtu"))
+    told = text.replace('mesh = "m.msh"', 'mesh = "m.msh"\ntissue_data = "PartId"')
+    assert read_states(grouped(told, write=parts, name="m.vtu")).mesh.volumes.sum() == pytest.approx(12e3)
 
 
 def test_a_plane_is_no_name_for_an_end_that_leans():

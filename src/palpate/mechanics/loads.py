@@ -143,8 +143,11 @@ def gravity(space: LagrangeSpace, densities: Array, acceleration: Array) -> Dead
 def boundary_named(mesh: TetMesh, name: str) -> NDArray[np.int64]:
     """Boundary triangles (n_faces, 3) beside the hollow tissue `name`, or on the cut of the image for "outer".
 
-    Their normals point out of the body. Raises `ConfigurationError` when there are none, with the names that have some.
+    Their normals point out of the body; a surface that shares faces with another has all of them. Raises
+    `ConfigurationError` when there are none, with the names that have some.
     """
+    if name in mesh.surfaces:
+        return mesh.boundary[mesh.surfaces[name]]
     names = {number: tissue.name for number, tissue in enumerate(mesh.tissues)} | {OUTER: "outer"}
     wanted = [number for number, known in names.items() if known == name]
     faces = mesh.boundary[np.isin(mesh.beyond, wanted)]

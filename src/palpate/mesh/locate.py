@@ -17,6 +17,7 @@ from palpate.parallel import mapped
 CANDIDATES = (8, 48, 240)  # tetrahedra that are tried, the ones with the nearest centroids first
 AT_ONCE = 200_000  # pairs of a point and a tetrahedron
 ON_A_FACE = 1e-9  # in barycentric coordinates
+ROUNDED = 1e-3  # of a tetrahedron's height: outside by so little is inside, as tables and meshes have few digits
 COLUMNS_AT_ONCE = 300_000  # columns of a tetrahedron that are tested at once by a thread, which bounds the memory
 
 
@@ -38,12 +39,16 @@ class Places:
 
 
 def located(mesh: TetMesh, points: NDArray[np.float64]) -> Places:
-    """Where points (n, 3) mm lie in the mesh."""
+    """Where points (n, 3) mm lie in the mesh; one that lies outside by rounding alone is in the tetrahedron beside it.
+
+    Its coordinates are then as little below 0: values there are continued, and those of a polynomial stay exact.
+    """
     corners = mesh.nodes[mesh.tets]
     inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])  # rows: edges; x - x0 = b @ edges
     tree = cKDTree(corners.mean(axis=1))
-    tet, barycentric = np.full(len(points), -1, dtype=np.int64), np.zeros((len(points), 4))
-    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    tet, barycentric = np.full(len(points), -1, dtype=np.int64), np.full((len(points), 4), -np.inf)
+    room = ROUNDED * np.ptp(corners, axis=1).max()
+    low, high = mesh.nodes.min(axis=0) - room, mesh.nodes.max(axis=0) + room
     left = np.flatnonzero(np.all((points >= low) & (points <= high), axis=1))
     for k in (min(k, len(mesh.tets)) for k in CANDIDATES):
         for part in np.array_split(left, 1 + len(left) * k // AT_ONCE):
@@ -53,10 +58,12 @@ def located(mesh: TetMesh, points: NDArray[np.float64]) -> Places:
             every = np.concatenate([1.0 - shares.sum(axis=2, keepdims=True), shares], axis=2)
             best = np.argmax(every.min(axis=2), axis=1)
             found = every[np.arange(len(part)), best]
-            good = found.min(axis=1) >= -ON_A_FACE
-            tet[part[good]] = near[np.arange(len(part)), best][good]
-            barycentric[part[good]] = found[good]
-        left = left[tet[left] < 0]
+            better = found.min(axis=1) > barycentric[part].min(axis=1)
+            tet[part[better]] = near[np.arange(len(part)), best][better]
+            barycentric[part[better]] = found[better]
+        left = left[barycentric[left].min(axis=1) < -ON_A_FACE]
+    out = barycentric.min(axis=1) < -ROUNDED
+    tet[out], barycentric[out] = -1, 0.0
     return Places(tet, barycentric)
 
 

@@ -1,179 +1,158 @@
-"""A tetrahedral mesh that somebody else made: what meshio reads, with its tissues and named surfaces."""
+"""A tetrahedral mesh that somebody else made: one value, whatever the format that it came in."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from importlib import import_module
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from palpate.errors import ConfigurationError, GeometryError, InputDataError
+from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.input_file import open_input
-from palpate.images.tissue import Tissue
-from palpate.mesh.tet_mesh import TetMesh
+from palpate.images.named_labels import printable
+from palpate.mesh.cutting import face_pieces
+from palpate.mesh.files.abaqus import read_abaqus
+from palpate.mesh.files.elements import MOST_BYTES, Elements, Name, Sets
+from palpate.mesh.files.exodus import read_exodus
+from palpate.mesh.files.others import read_by_meshio, read_gmsh, read_med
+from palpate.mesh.tet_mesh import FACE_PAIRS
 from palpate.mesh.tetrahedralise import boundary_of
 
-MOST_BYTES = 4 * 2**30
+READERS = {".msh": read_gmsh, ".inp": read_abaqus, ".med": read_med}
+READERS |= dict.fromkeys((".e", ".exo", ".ex2", ".exii", ".g", ".gen"), read_exodus)
 TETRAHEDRA, TRIANGLES = ("tetra", "tetra10"), ("triangle", "triangle6")
-GROUPS = ("tissue", "label", "region", "medit:ref", "gmsh:physical", "MaterialID", "material", "CellEntityIds")
-WHOLE = "boundary"
-PLANES = tuple(f"{axis}_{end}" for axis in "xyz" for end in ("min", "max"))
-LEANS_DEG = 15.0  # of a surface against the plane that it is named by
+HOLLOW = ("vertex", "line", "tri", "quad", "polygon", "VTK_LAGRANGE_C", "VTK_LAGRANGE_TR", "VTK_LAGRANGE_Q")
 SLIVER = 1e-9  # volume over the cube of the longest edge
+JOINED = 1e-3  # of the shortest edge at a node: another one so near is meant to be the same
 
 
 @dataclass(frozen=True, slots=True)
 class MeshFile:
-    """Nodes (n, 3) mm, tets (n_tets, 4) of positive volume, group (n_tets,) of each; names of groups, where it has any.
+    """Nodes (n, 3) mm, all of tetrahedra; tets (n_tets, 4) of positive volume; piece (n_tets,) that hangs by faces.
 
-    surfaces: triangles (n_faces, 3) by the name of their group; digest: SHA-256 of the file.
+    groups: numbers (n,) of tetrahedra, and surfaces: triangles (n_faces, 3) of nodes, -1 for one that is none of the
+    mesh, by the name or number of their group; one may belong to several. about: what else the file says of groups;
+    digest: SHA-256 of the file.
     """
 
     nodes: NDArray[np.float64]
     tets: NDArray[np.int64]
-    group: NDArray[np.int64]
-    names: Mapping[int, str] = field(default_factory=dict)
-    surfaces: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
-    digest: str = ""
+    piece: NDArray[np.int64]
+    groups: Mapping[Name, NDArray[np.int64]]
+    surfaces: Mapping[Name, NDArray[np.int64]]
+    about: str
+    digest: str
 
 
 def read_mesh_file(path: Path, *, data: str | None = None) -> MeshFile:
-    """Read tetrahedra of 4 or 10 nodes (of the latter the corners) and their groups; RAS mm.
+    """Read tetrahedra of 4 or 10 nodes (of the latter the corners), their groups and named surfaces; RAS mm.
 
-    data: the cell data that tell the tissue; by default the first of the usual names, or one group, 1. Raises
-    `InputDataError` for a file that holds no such mesh, `ConfigurationError` where meshio is not installed.
+    data: the cell data that tell the tissue, by default the first of the usual names. Raises `InputDataError` for a
+    file that holds no such mesh, or more, `ConfigurationError` where meshio is missing.
     """
-    try:
-        meshio = import_module("meshio")
-    except ImportError as error:
-        raise ConfigurationError(f"meshio reads '{path}': pip install 'palpate[mesh]'") from error
     try:
         with open_input(path) as file:
             if file.n_bytes > MOST_BYTES:
                 raise InputDataError(f"'{path}' has {file.n_bytes / 2**30:.1f} GB; meshes of up to 4 GB are read")
-            digest = file.sha256()
+            content, digest = file.read(), file.sha256()
     except (OSError, ValueError) as error:
         raise InputDataError(f"'{path}' cannot be read: {error}; check the path") from error
+    reader = READERS.get(path.suffix.lower())
+    if reader is read_gmsh and b"$MeshFormat" not in content[:4096]:
+        reader = None  # the ending is Fluent's, too
     try:
-        mesh = meshio.read(path)
-    except SystemExit as error:  # meshio ends the program for some files
-        raise InputDataError(f"'{path}' is no mesh that meshio reads; export it as .vtu or .msh") from error
-    except Exception as error:  # meshio raises what its formats raise
-        raise InputDataError(f"'{path}' is no mesh that meshio reads: {type(error).__name__}: {error}") from error
-    nodes = np.asarray(mesh.points, dtype=np.float64)
-    chosen = [i for i, block in enumerate(mesh.cells) if block.type in TETRAHEDRA]
-    if not chosen or nodes.ndim != 2 or nodes.shape[1] != 3:
-        kinds = sorted({block.type for block in mesh.cells})
-        raise InputDataError(f"'{path}' holds {kinds} and no tetrahedra; export a volume mesh of 4 or 10 nodes a cell")
-    tets = np.concatenate([np.asarray(mesh.cells[i].data)[:, :4] for i in chosen]).astype(np.int64)
-    group = _groups(mesh, chosen, data, path)
-    of_tets, of_faces = (
-        {int(ids[0]): str(name)[:200] for name, ids in mesh.field_data.items() if len(ids) > 1 and ids[1] == dimension}
-        for dimension in (3, 2)
-    )
-    nodes, tets = _sound(nodes, tets, path)
-    parts: dict[str, list[NDArray[np.int64]]] = {}
-    for i, block in enumerate(mesh.cells):
-        if block.type in TRIANGLES and "gmsh:physical" in mesh.cell_data:
-            numbers = np.asarray(mesh.cell_data["gmsh:physical"][i]).astype(np.int64)
-            for number in np.unique(numbers).tolist():
-                own = np.asarray(block.data)[numbers == number, :3].astype(np.int64)
-                parts.setdefault(of_faces.get(number, str(number)), []).append(own)
-    surfaces = {name: np.concatenate(own) for name, own in parts.items()}
-    return MeshFile(nodes, tets, group, of_tets, surfaces, digest)
-
-
-def _groups(mesh: Any, chosen: Sequence[int], data: str | None, path: Path) -> NDArray[np.int64]:
-    """The group (n_tets,) of each tetrahedron."""
-    known = mesh.cell_data
-    key = data or next((name for name in GROUPS if name in known), None)
-    if key is None:
-        return np.ones(sum(len(mesh.cells[i].data) for i in chosen), dtype=np.int64)
-    if key not in known:
-        raise InputDataError(f"'{path}' has no cell data '{key}'; name one of {sorted(known)}")
-    values = np.concatenate([np.asarray(known[key][i]).ravel() for i in chosen])
-    if not np.array_equal(values, np.rint(values)):
-        raise InputDataError(f"the cell data '{key}' of '{path}' are no whole numbers; name others in tissue_data")
-    return values.astype(np.int64)
-
-
-def _sound(
-    nodes: NDArray[np.float64], tets: NDArray[np.int64], path: Path
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Used nodes alone, and tetrahedra turned to a positive volume; `InputDataError` for what is no mesh."""
-    if len(tets) == 0 or tets.min() < 0 or tets.max() >= len(nodes):
+        read = reader(content, data) if reader else read_by_meshio(path, data)
+        return _sound(read, digest)
+    except InputDataError as error:
+        raise InputDataError(f"'{path}' is no mesh that is read: {error}") from error
+    except ConfigurationError:
+        raise
+    except Exception as error:  # libraries raise what they like
         raise InputDataError(
-            f"the tetrahedra of '{path}' name nodes that it has not ({len(nodes)} nodes); export it again"
+            f"'{path}' is no mesh that is read: {type(error).__name__} {printable(str(error))[:200]}; export it as .msh"
+            " of version 4.1, or as plain .vtu"
+        ) from error
+
+
+def _sound(read: Elements, digest: str) -> MeshFile:
+    """The mesh, its nodes numbered anew, with all that speaks of them; `InputDataError` for what is no sound one."""
+    tets, of_tets = read.of(TETRAHEDRA, 4)
+    triangles, of_triangles = read.of(TRIANGLES, 3)
+    count = Counter[str]()
+    for kind, rows in read.blocks:
+        count[kind] += len(rows)
+    others = ", ".join(
+        f"{n} {kind}" for kind, n in count.items() if n and kind not in TETRAHEDRA and not kind.startswith(HOLLOW)
+    )
+    if others and len(tets):
+        raise InputDataError(
+            f"beside {len(tets)} tetrahedra it has {others}: split these into tetrahedra of 4 or 10 nodes"
         )
-    used, places = np.unique(tets, return_inverse=True)
-    nodes, tets = nodes[used], places.reshape(tets.shape).astype(np.int64)
+    if not len(tets):
+        raise InputDataError(f"it holds {dict(count)} and no tetrahedra; export a volume mesh of 4 or 10 nodes a cell")
+    if tets.min() < 0 or tets.max() >= len(read.points) or read.points.shape[1] != 3:
+        raise InputDataError(f"its tetrahedra name nodes that it has not ({len(read.points)} nodes); export it again")
+    _, first, same = np.unique(np.sort(tets, axis=1), axis=0, return_index=True, return_inverse=True)
+    kept = np.sort(first)  # gmsh writes what is in two groups twice
+    number = np.full((2, sum(count.values())), -1)
+    number[0, of_tets] = np.searchsorted(kept, first)[same.ravel()]
+    number[1, of_triangles] = np.arange(len(triangles))
+    used, places = np.unique(tets[kept], return_inverse=True)
+    nodes, tets = read.points[used], places.reshape(-1, 4)
+    new = np.full(len(read.points), -1)
+    new[used] = np.arange(len(used))
+    tets, piece = _oriented(nodes, tets)
+    groups = {name: own for name, own in _members(read.sets, number[0]).items() if len(own)}
+    if not any(isinstance(name, int) for name in groups) and len(groups) < 2:
+        groups[1] = np.arange(len(tets))
+    shown = {name: new[triangles[own]] for name, own in _members(read.sets, number[1]).items() if len(own)}
+    surfaces = {name: np.unique(np.sort(rows, axis=1), axis=0) for name, rows in shown.items()}
+    faces = boundary_of(tets) if read.point_sets else tets[:0, :3]
+    for name, own in _members(read.point_sets, new).items():
+        surfaces.setdefault(name, faces[np.isin(faces, own).all(axis=1)])
+    return MeshFile(nodes, tets, piece, groups, surfaces, read.about, digest)
+
+
+def _members(sets: Sets, number: NDArray[np.int64]) -> dict[Name, NDArray[np.int64]]:
+    """New numbers of the members of each set, each once, by the old ones' new `number`, -1 for what is left out."""
+    shown = {name: name if isinstance(name, int) else printable(name)[:200] for name in sets}
+    every = {shown[name]: np.unique(number[np.concatenate(parts)]) for name, parts in sets.items() if parts}
+    return {name: own[own >= 0] for name, own in every.items()}
+
+
+def _oriented(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Tetrahedra of positive volume, and the piece of each; `InputDataError` for flat ones, cracks and overlaps."""
     if not np.isfinite(nodes).all():
-        raise InputDataError(f"a node of '{path}' has a coordinate that is no number; export it again")
+        raise InputDataError("a node has a coordinate that is no number; export it again")
     corners = nodes[tets]
     volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
-    longest = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=3).max(axis=(1, 2))
-    flat = np.flatnonzero(np.abs(volumes) <= SLIVER * longest**3)
-    if len(flat):
-        place = np.round(corners[flat[0]].mean(axis=0), 2).tolist()
+    edges = np.linalg.norm(corners[:, FACE_PAIRS[:, 0]] - corners[:, FACE_PAIRS[:, 1]], axis=2)
+    flat = np.abs(volumes) <= SLIVER * edges.max(axis=1) ** 3
+    if flat.any():
+        where = _place(corners[flat].mean(axis=1))
         raise InputDataError(
-            f"{len(flat)} tetrahedra of '{path}' have no volume, the first at {place} mm; repair it, by Mmg or gmsh"
+            f"{flat.sum()} of its tetrahedra have no volume, the first {where}; repair it, by Mmg or gmsh"
         )
-    tets = np.where(volumes[:, None] < 0.0, tets[:, [0, 2, 1, 3]], tets)
-    return nodes, tets
-
-
-def plane_faces(
-    nodes: NDArray[np.float64], faces: NDArray[np.int64], plane: str, within_mm: float
-) -> NDArray[np.bool_]:
-    """Which faces (n_faces, 3) lie within so many mm of a plane of `PLANES`, or on the `WHOLE` boundary.
-
-    Raises `GeometryError` where they lean against it, as the part of a bent tip does that reaches furthest.
-    """
-    if plane == WHOLE:
-        return np.ones(len(faces), dtype=bool)
-    axis, end = "xyz".index(plane[0]), plane[2:]
-    along = nodes[:, axis] if end == "max" else -nodes[:, axis]
-    found = np.asarray(along[faces].min(axis=1) >= along.max() - within_mm)
-    a, b, c = np.moveaxis(nodes[faces[found]], 1, 0)
-    area = np.abs(np.cross(b - a, c - a).sum(axis=0))
-    lean = float(np.degrees(np.arccos(min(area[axis] / max(float(np.linalg.norm(area)), 1e-300), 1.0))))
-    if found.any() and lean > LEANS_DEG:
-        raise GeometryError(
-            f"the faces within {within_mm:g} mm of {plane} lean against that plane by {lean:.0f} degrees: they are part"
-            " of a surface that does not lie along it; name the surface by a group of faces of the mesh's file"
+    shortest = np.full(len(nodes), np.inf)
+    np.minimum.at(shortest, tets, edges.min(axis=1)[:, None])
+    near = np.asarray(cKDTree(nodes).query(nodes, k=2)[0])[:, 1]
+    apart = near < JOINED * shortest
+    if apart.any():
+        raise InputDataError(
+            f"{apart.sum()} of its nodes lie on another one that they are not joined to, as at a crack, the first"
+            f" {_place(nodes[apart])}, {near[apart][0]:.2g} mm apart; merge such nodes (gmsh: Coherence Mesh)"
         )
-    return found
-
-
-def body_mesh(
-    file: MeshFile,
-    tissues: Sequence[Tissue],
-    region: NDArray[np.int64],
-    surfaces: Mapping[str, NDArray[np.bool_]],
-    beyond: int,
-) -> TetMesh:
-    """The mesh of a file with tissues region (n_tets,), behind whose boundary faces hollow tissues lie.
-
-    surfaces: boundary faces (n_boundary,) by the name of the hollow tissue behind them, the first one counts where two
-    have a face; beyond: number of that behind all others. Raises `GeometryError` for a surface without a face.
-    """
-    boundary = boundary_of(file.tets)
-    behind = np.full(len(boundary), beyond)
-    names = [tissue.name for tissue in tissues]
-    for name, faces in list(surfaces.items())[::-1]:
-        if not faces.any():
-            raise GeometryError(
-                f"the surface '{name}' has no face of the mesh's boundary; make within_mm larger, or name another"
-            )
-        behind[faces] = names.index(name)
-    covered = [name for name in surfaces if not np.any(behind == names.index(name))]
-    if covered:
-        raise GeometryError(
-            f"all faces of the surface '{covered[0]}' belong to surfaces that are named before it; name it first, or"
-            " leave it out"
+    piece, with_face = face_pieces(tets)
+    if with_face.max() > 2:
+        raise InputDataError(
+            f"{(with_face > 2).sum()} faces belong to over two tetrahedra, which overlap: mesh it anew"
         )
-    return TetMesh(file.nodes, file.tets, region, boundary, behind, tuple(tissues))
+    return np.where(volumes[:, None] < 0.0, tets[:, [0, 2, 1, 3]], tets), piece
+
+
+def _place(points: NDArray[np.float64]) -> str:
+    return f"at {np.round(points[0], 2).tolist()} mm"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,8 @@ class TetMesh:
 
     nodes (n_nodes, 3) RAS mm; tets (n_tets, 4) node numbers, positive volume; region (n_tets,) index into `tissues`;
     boundary (n_boundary, 3) the mesh's outer faces, normals pointing out of the mesh; beyond (n_boundary,) the hollow
-    tissue behind each of them (index into `tissues`) or OUTER where the image is cut.
+    tissue behind each of them (index into `tissues`) or OUTER where the image is cut; surfaces: all faces (n_boundary,)
+    of a hollow tissue, by its name, where others have some of them too.
     """
 
     nodes: NDArray[np.float64]
@@ -30,6 +32,7 @@ class TetMesh:
     boundary: NDArray[np.int64]
     beyond: NDArray[np.int64]
     tissues: tuple[Tissue, ...]
+    surfaces: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, dtype in (("nodes", float), ("tets", int), ("region", int), ("boundary", int), ("beyond", int)):

@@ -67,9 +67,14 @@ def input_images(pairs: tuple[ImagePair, ...]) -> tuple[InputImage, ...]:
         images = (pair.result.before, *pair.result.after)
         digests = [pair.result.provenance.inputs.get(name, "") for name in keys]
         for later, (name, image, sha256) in enumerate(zip((pair.before, *pair.after), images, digests, strict=True)):
-            counts = np.bincount(image.index.ravel(), minlength=len(image.tissues))
             x, y, z = (float(edge) for edge in image.grid.spacing)
-            volumes = tuple((counts * (image.grid.voxel_volume / 1000.0)).tolist())
+            volume = np.asarray(
+                image.grid.voxel_volume * np.bincount(image.index.ravel(), minlength=len(image.tissues))
+            )
+            if pair.result.case.body is not None:  # its voxels only show the mesh
+                mesh = pair.result.space.mesh
+                volume = np.asarray(np.bincount(mesh.region, mesh.volumes, minlength=len(image.tissues)))
+            volumes = tuple((volume / 1000.0).tolist())
             found.append(InputImage(name, number, later > 0, image.grid.shape, (x, y, z), volumes, sha256))
     return tuple(found)
 

@@ -59,9 +59,9 @@ class MeshBody:
 class CaseSurface:
     """A named surface of a mesh: a group of triangles, an outermost plane, or all of the boundary.
 
-    `where`: the group's name, "x_min" ... "z_max" within `within_mm`, or "boundary". `boundary` "moving": its motion is
-    an unknown; "fixed": it is held; "sliding": it moves within itself alone; "free": nothing holds it, loads may act;
-    "prescribed": it moves as the measured points of its state say.
+    `where`: the group's name or number, "x_min" ... "z_max" within `within_mm`, or "boundary". `boundary` "moving": its
+    motion is an unknown; "fixed": it is held; "sliding": it moves within itself alone; "free": nothing holds it, loads
+    may act; "prescribed": it moves as the measured points of its state say.
     """
 
     name: str

@@ -235,7 +235,7 @@ def checked_case(
     before, after = pairs[0].before, pairs[0].after
     names = ("before", *(f"after[{i}]" for i in range(len(after))))
     organs = tuple(
-        OrganRow(t.name, str(t.role), tuple(round(image.volume(i) / 1000.0, 4) for image in (before, *after)))
+        OrganRow(t.name, str(t.role), tuple(round(volume / 1000.0, 4) for volume in pairs[0].volumes(i)))
         for i, t in enumerate(before.tissues)
         if t.meshed or pairs[0].mesh is None
     )
@@ -295,6 +295,7 @@ def _further_problems(problems: _Problems, case: Case, progress: Progress) -> tu
     problems.attempt(partial(require_samples, case))
     if case.phantom is not None or case.body is not None:  # nothing to read one by one
         states = problems.attempt(partial(read_states, case, progress=progress))
+        problems.warn(() if states is None else states.findings)
         return () if states is None else (states,)
     found, first = list[ImagedStates](), 0
     for before, after in _read_pairs(case, problems):

@@ -55,6 +55,12 @@ class ImagedStates:
         """Number of later states, imaged or not."""
         return max(len(self.bones), len(self.after))
 
+    def volumes(self, tissue: int) -> tuple[float, ...]:
+        """Volume (mm^3) of a tissue in each image, or that of its tetrahedra in a body that is given as a mesh."""
+        if self.mesh is not None:
+            return (float(self.mesh.volumes[self.mesh.region == tissue].sum()),)
+        return tuple(image.volume(tissue) for image in (self.before, *self.after))
+
     @property
     def later(self) -> tuple[Segmentation | None, ...]:
         """The image of each later state, None where there is none."""

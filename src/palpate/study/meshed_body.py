@@ -8,13 +8,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import ConfigurationError
+from palpate.errors import ConfigurationError, InputDataError
+from palpate.findings import Finding
 from palpate.images.alignment import Motion
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.loads import boundary_named
-from palpate.mesh.mesh_file import PLANES, WHOLE, MeshFile, body_mesh, plane_faces, read_mesh_file
+from palpate.mesh.files.elements import Name
+from palpate.mesh.mesh_file import MeshFile, read_mesh_file
+from palpate.mesh.named_faces import PLANES, WHOLE, listed_faces, plane_faces, tissues_behind
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
@@ -24,10 +27,12 @@ from palpate.observation.measured_points import MeasuredPoints
 from palpate.progress import Progress
 from palpate.study.case import Case
 from palpate.study.case_body import MeshBody
+from palpate.study.case_tissue import REMAINING, CaseTissue
 from palpate.study.imaged import ImagedStates
-from palpate.study.schema import nearest
+from palpate.study.schema import nearest, shown
 
 OUTSIDE = "outside"
+USUAL_MM = (2.0, 3e3)  # the length of a body: one in metres, or in micrometres, lies outside
 VOXELS_AN_EDGE, MOST_VOXELS, BORDER = 2.5, 4e6, 3  # of the label image that shows the mesh
 
 
@@ -38,6 +43,7 @@ def mesh_states(body: MeshBody, case: Case, *, progress: Progress) -> ImagedStat
     """
     file = read_mesh_file(body.mesh, data=body.tissue_data)
     progress(f"'{body.mesh.name}': {len(file.tets)} tetrahedra, {len(file.nodes)} nodes")
+    findings = _findings(file, case)
     mesh = _mesh(file, case)
     # voxels that show the mesh: some along an edge, and a border around
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
@@ -49,7 +55,7 @@ def mesh_states(body: MeshBody, case: Case, *, progress: Progress) -> ImagedStat
     index = voxelise(lagrange_space(mesh, "P1"), np.zeros_like(mesh.nodes), grid, crossing=True)
     before = Segmentation(index, grid, mesh.tissues)
     bones = tuple(dict[int, Motion]() for _ in range(case.n_states))
-    return ImagedStates(before, (), bones, (), inputs={"mesh": file.digest}, mesh=mesh)
+    return ImagedStates(before, (), bones, findings, inputs={"mesh": file.digest}, mesh=mesh)
 
 
 def with_prescribed(states: ImagedStates, case: Case) -> ImagedStates:
@@ -76,39 +82,97 @@ def with_prescribed(states: ImagedStates, case: Case) -> ImagedStates:
     return replace(states, bones=tuple(found))
 
 
+def _findings(file: MeshFile, case: Case) -> tuple[Finding, ...]:
+    """What is odd of a mesh: its size, several pieces; `InputDataError` where surfaces would take all of it."""
+    found, length = list[Finding](), float(np.ptp(file.nodes, axis=0).max())
+    if not USUAL_MM[0] <= length <= USUAL_MM[1]:
+        unit, factor = ("metres", 1e3) if length < USUAL_MM[0] else ("micrometres", 1e-3)
+        text = f"the mesh is {length:.3g} mm long; if it was written in {unit}, multiply its coordinates by {factor:g}"
+        wide = [s.name for s in case.surfaces if s.where in PLANES and s.within_mm > 0.5 * length]
+        if wide:
+            raise InputDataError(f"{text}; else make within_mm of '{wide[0]}' smaller, which takes all of the mesh")
+        found.append(Finding("units", text))
+    count = np.bincount(file.piece)
+    if len(count) > 1:
+        place = np.round(file.nodes[file.tets[file.piece == count.argmin()]].mean(axis=(0, 1)), 1).tolist()
+        text = (
+            f"the mesh has {len(count)} pieces that share no face, the largest of {count.max()} tetrahedra, the"
+            f" smallest of {count.min()} around {place} mm: no stress passes between them; join what is one body"
+        )
+        found.append(Finding("islands", text))
+    return tuple(found)
+
+
 def _mesh(file: MeshFile, case: Case) -> TetMesh:
     """The mesh with the case's tissues, and a hollow one behind each named surface."""
-    groups = {number: file.names.get(number, str(number)) for number in np.unique(file.group).tolist()}
-    tissues, region = list[Tissue](), np.full(len(file.tets), -1)
-    for stated in case.tissues:
-        tissue = stated.resolve(groups)
+    solid, region = _regions(file, case)
+    tissues = (*solid, *(surface.behind for surface in case.surfaces), Tissue(OUTSIDE, Role.VOID))
+    faces, surfaces, grouped = boundary_of(file.tets), dict[str, NDArray[np.bool_]](), dict[str, NDArray[np.bool_]]()
+    for surface in case.surfaces:
+        group = _group(surface.where, file.surfaces)
+        if group is not None:
+            found = grouped[surface.name] = listed_faces(faces, group, surface.where)
+        elif surface.where in (WHOLE, *PLANES):
+            found = plane_faces(file.nodes, faces, surface.where, surface.within_mm)
+        else:
+            known = nearest(surface.where, [WHOLE, *PLANES, *map(str, file.surfaces)])
+            raise ConfigurationError(
+                f"[[surfaces]] '{surface.name}': the mesh has no surface '{surface.where}': {known}"
+            )
+        surfaces[surface.name] = found
+    behind = tissues_behind(surfaces, tuple(grouped), tissues, len(faces))
+    return TetMesh(file.nodes, file.tets, region, faces, behind, tissues, grouped)
+
+
+def _regions(file: MeshFile, case: Case) -> tuple[list[Tissue], NDArray[np.int64]]:
+    """The case's tissues and which one (n_tets,) each tetrahedron is of; `ConfigurationError` unless it is one."""
+    labels = [stated.label for stated in case.tissues]
+    tissues = [
+        stated.with_labels(label if isinstance(label, tuple) else ())
+        for stated, label in zip(case.tissues, labels, strict=True)
+    ]
+    region = np.full(len(file.tets), -1)
+    for number in sorted(range(len(tissues)), key=lambda n: labels[n] == REMAINING):
+        tissue = tissues[number]
         if not tissue.meshed:
             raise ConfigurationError(
                 f"tissue '{tissue.name}' has the role {tissue.role}, but a mesh holds solid ones alone: name hollow"
                 " spaces and what moves as [[surfaces]]"
             )
-        own = np.isin(file.group, tissue.labels) if tissue.labels else region < 0
-        region[own & (region < 0)] = len(tissues)
-        tissues.append(tissue)
-    left = sorted(set(file.group[region < 0].tolist()))
-    if left:
+        own = np.flatnonzero(region < 0) if labels[number] == REMAINING else _tets(file, case.tissues[number])
+        if not len(own):
+            raise ConfigurationError(f"tissue '{tissue.name}' has no tetrahedron: the others have all; leave it out")
+        twice = region[own[region[own] >= 0]]
+        if len(twice):
+            both = f"'{tissues[twice[0]].name}' and '{tissue.name}'"
+            raise ConfigurationError(f"{len(twice)} tetrahedra are in groups of {both}; give each to one tissue")
+        region[own] = number
+    left = np.flatnonzero(region < 0)
+    if len(left):
+        groups = sorted(str(name) for name, own in file.groups.items() if np.isin(own, left).any())
         raise ConfigurationError(
-            f"no tissue of the case has the group(s) {[groups[n] for n in left]} of the mesh; give each a tissue,"
-            ' or one label = "remaining"'
+            f"no tissue of the case has {len(left)} of the tetrahedra, which are in the group(s) {groups} of the mesh;"
+            ' give each a tissue, or one label = "remaining"'
         )
-    faces, surfaces = boundary_of(file.tets), dict[str, NDArray[np.bool_]]()  # which (n_boundary,) belong to each
-    for surface in case.surfaces:
-        if surface.where in (WHOLE, *PLANES):
-            surfaces[surface.name] = plane_faces(file.nodes, faces, surface.where, surface.within_mm)
-            continue
-        if surface.where not in file.surfaces:
-            known = nearest(surface.where, [WHOLE, *PLANES, *file.surfaces])
+    return tissues, region
+
+
+def _tets(file: MeshFile, stated: CaseTissue) -> NDArray[np.int64]:
+    """The tetrahedra of the groups that a tissue names."""
+    found = list[NDArray[np.int64]]()
+    for label in stated.label if isinstance(stated.label, tuple) else (stated.label,):
+        group = _group(label, file.groups)
+        if group is None:
+            known = f"its groups: {nearest(str(label), map(str, file.groups))}" if file.groups else "it has no groups"
             raise ConfigurationError(
-                f"[[surfaces]] '{surface.name}': the mesh has no surface '{surface.where}': {known}"
+                f"tissue '{stated.name}' has no tetrahedron: the mesh has no group {shown(label)}; {known}"
+                + (f"; {file.about}" if file.about else "")
             )
-        listed = {tuple(face) for face in np.sort(file.surfaces[surface.where], axis=1).tolist()}
-        there = [tuple(face) in listed for face in np.sort(faces, axis=1).tolist()]
-        surfaces[surface.name] = np.array(there, dtype=bool)
-    tissues += [surface.behind for surface in case.surfaces]
-    tissues.append(Tissue(OUTSIDE, Role.VOID))
-    return body_mesh(file, tissues, region, surfaces, len(tissues) - 1)
+        found.append(group)
+    return np.unique(np.concatenate(found))
+
+
+def _group(key: Name, groups: Mapping[Name, NDArray[np.int64]]) -> NDArray[np.int64] | None:
+    """The group of a name or a number, else the only one whose name differs in small and large letters alone."""
+    alike = [name for name in groups if str(name).casefold() == str(key).casefold()]
+    return groups.get(key, groups[alike[0]] if len(alike) == 1 else None)

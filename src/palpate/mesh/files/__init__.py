@@ -1,0 +1,1 @@
+"""Volume meshes that other programs wrote, as their files hold them."""
