@@ -10,6 +10,8 @@ import contextlib
 import gzip
 import math
 import os
+from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
+from palpate.findings import Finding
 from palpate.images.label_image import LPS_TO_RAS, LabelImage, VoxelGrid, corners_apart
 from palpate.images.readers.nifti_extension import extension_names
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
@@ -34,10 +37,47 @@ from palpate.images.readers.voxel_stream import (
 MILLIMETRES = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}  # xyzt_units: unknown, metre, millimetre, micrometre
 HEADERS = {348: "Nifti1Header", 540: "Nifti2Header"}  # by nibabel, which is imported when an image comes
 MAGIC = {348: b"n+1\0", 540: b"n+2\0\r\n\032\n"}
+PAIR = (".hdr", ".img", ".hdr.gz", ".img.gz")
+VECTORS = {1005: "symmetric matrices", 1006: "displacements", 1007: "vectors", 2003: "colours", 2004: "colours"}
+LONGEST = 1.001  # of a quaternion, whose length is 1 but for rounding
+NO_ROOT = 1e-7  # nifti1_io.c: less than this of 1 - b^2 - c^2 - d^2 is rounding, and the turn is by 180 degrees
+
+
+@dataclass(frozen=True, slots=True)
+class NiftiContent:
+    """What a NIfTI file holds.
+
+    `header`: nibabel's, as the file has it. `values`: as the header scales them, of as many axes as it has sizes.
+    `scale`: its slope and intercept. `extensions`: the bytes between header and voxels. `sha256`: of the whole file.
+    """
+
+    header: Any
+    values: NDArray[Any]
+    scale: tuple[float, float]
+    extensions: bytes
+    sha256: str
 
 
 def read_nifti(path: Path) -> StoredImage:
     """Read one image of three axes from `path`; raises `InputDataError` with a sentence for whatever is wrong."""
+    content = nifti_content(path, _three_axes)
+    affine = nifti_affine(content.header, path)
+    names = extension_names(content.extensions, content.header.endianness, path)
+    values = content.values.reshape(content.values.shape[:3])
+    return StoredImage(values, affine, names, {"": content.sha256}, scale=content.scale)
+
+
+def nifti_content(path: Path, check: Callable[[Any, tuple[int, ...], Path], None]) -> NiftiContent:
+    """Read header and voxels of the file at `path`.
+
+    `check` gets the header, the sizes of its axes and `path` before memory is taken, and raises where they are not what
+    is read. Raises `InputDataError` for a file that is damaged, or is no NIfTI file in one piece.
+    """
+    if path.name.lower().endswith(PAIR):
+        raise InputDataError(
+            f"'{path}' is one half of a .hdr/.img pair (NIfTI or Analyze), which is not read; convert both to one .nii.gz"
+            " file (3D Slicer, fslchfiletype, mri_convert), and see there that left and right are right"
+        )
     with opened(path) as file:
         zipped = file.peek(2)[:2] == b"\x1f\x8b"
         if zipped != path.name.lower().endswith(".gz"):
@@ -58,20 +98,19 @@ def read_nifti(path: Path) -> StoredImage:
                 " .hdr/.img pairs to .nii.gz"
             )
         header = getattr(import_module("nibabel"), HEADERS[used])(content, endianness=sign, check=False)
-        block, slope, intercept = _block(header, path)
-        affine = _affine(header, path)
+        block, (slope, intercept) = _block(header, path)
+        check(header, block.shape, path)
         check_size(block.shape, block.skip + block.n_bytes, path, available=file.n_bytes, packed=zipped)
         between = read_exactly(stream, block.skip - used, path).tobytes()
         values = read_voxels(stream, block, path)
-        digests = {"": file.sha256()}
+        sha256 = file.sha256()
     if (slope, intercept) != (1.0, 0.0):
         with np.errstate(over="ignore", invalid="ignore"):
             values = np.asarray(values * slope + intercept)
-    names = extension_names(between, header.endianness, path)
-    return StoredImage(values, affine, names, digests)
+    return NiftiContent(header, values, (slope, intercept), between, sha256)
 
 
-def _block(header: Any, path: Path) -> tuple[VoxelBlock, float, float]:
+def _block(header: Any, path: Path) -> tuple[VoxelBlock, tuple[float, float]]:
     """What the header says of the voxels, and the slope and intercept of their scale."""
     header_error = import_module("nibabel.spatialimages").HeaderDataError
     try:
@@ -88,11 +127,6 @@ def _block(header: Any, path: Path) -> tuple[VoxelBlock, float, float]:
     sizes = dim[1 : 1 + dim[0]] if 1 <= dim[0] <= 7 else []
     if not sizes or min(sizes) < 1:
         raise InputDataError(f"the header of '{path}' gives the sizes {dim}, not positive counts; export it again")
-    if len(sizes) < 3 or any(n > 1 for n in sizes[3:]):
-        raise InputDataError(
-            f"'{path}' has the sizes {sizes}, but an image of three axes is needed; extract one volume (a time point,"
-            " a channel) or stack the slices"
-        )
     first = int(header["sizeof_hdr"]) + 4  # four bytes announce extensions; 0 is written by old programs for this
     offset = float(header["vox_offset"]) or float(first)
     if not math.isfinite(offset) or not first <= offset <= MAX_OFFSET:
@@ -100,40 +134,84 @@ def _block(header: Any, path: Path) -> tuple[VoxelBlock, float, float]:
             f"the header of '{path}' puts the first voxel at byte {offset:g}, not between {first} and {MAX_OFFSET};"
             " export the image again"
         )
-    block = VoxelBlock((sizes[0], sizes[1], sizes[2]), dtype, skip=int(offset))
-    return block, 1.0 if slope is None else float(slope), 0.0 if intercept is None else float(intercept)
+    scale = (1.0 if slope is None else float(slope), 0.0 if intercept is None else float(intercept))
+    return VoxelBlock(tuple(sizes), dtype, skip=int(offset)), scale
 
 
-def _affine(header: Any, path: Path) -> NDArray[np.float64]:
-    """Index -> RAS mm by the sform or the qform; where both are set, they must agree."""
-    header_error = import_module("nibabel.spatialimages").HeaderDataError
-    try:
-        with np.errstate(all="ignore"):  # what is not finite is refused later, with its numbers
-            affine = header.get_sform(coded=True)[0]
-            qform = header.get_qform(coded=True)[0]
-    except (header_error, ValueError) as error:
-        raise InputDataError(f"the qform in the header of '{path}' is damaged: {error}; set an sform") from error
-    if affine is not None and qform is not None:
+def _three_axes(header: Any, sizes: tuple[int, ...], path: Path) -> None:
+    if len(sizes) < 3 or any(n > 1 for n in sizes[3:]):
+        intent = int(header["intent_code"])
+        of = f" of {VECTORS[intent]} (intent {intent})" if intent in VECTORS else ""
+        raise InputDataError(
+            f"'{path}' has the sizes {list(sizes)}{of}, but an image of three axes is needed; extract one volume (a time"
+            " point, a channel) or stack the slices"
+        )
+
+
+def nifti_affine(header: Any, path: Path) -> NDArray[np.float64]:
+    """The affine (4, 4), index -> RAS mm, of nibabel's NIfTI header: its sform, else its qform, in its unit of length.
+
+    Where both are set, they must agree; a damaged qform does not matter beside a sform. `path` is for messages.
+    Raises `InputDataError`; that the affine is finite and upright is not checked.
+    """
+    sform = _sform(header) if int(header["sform_code"]) > 0 else None
+    qform, flaw = _qform(header) if int(header["qform_code"]) > 0 else (None, "")
+    if sform is None and flaw:
+        raise InputDataError(f"the qform in the header of '{path}' is damaged: {flaw}; set an sform")
+    if sform is not None and qform is not None:
         # which of two places is right, nobody can tell here; half a voxel is more than rounding
-        apart, voxel = corners_apart([float(n) for n in header["dim"][1:4]], affine, qform)
+        apart, voxel = corners_apart([float(n) for n in header["dim"][1:4]], sform, qform)
         if apart > 0.5 * voxel:
             raise InputDataError(
                 f"sform and qform in the header of '{path}' place its corners up to {apart:.3g} mm apart; delete the"
                 " wrong one (set its code to 0), or export the image again"
             )
-    affine = qform if affine is None else affine
+    affine = qform if sform is None else sform
     if affine is None:
         raise InputDataError(
             f"the header of '{path}' has neither sform nor qform, so left and right are unknown; export the image with"
             " its orientation, or set the sform yourself"
         )
+    with np.errstate(all="ignore"):  # what is not finite is refused later, with its numbers
+        affine[:3] *= nifti_millimetres(header, path)
+    return affine
+
+
+def nifti_millimetres(header: Any, path: Path) -> float:
+    """How many mm the unit of length in nibabel's NIfTI header is; one that is not stated is taken for mm.
+
+    Raises `InputDataError` for a unit that does not exist.
+    """
     unit = int(header["xyzt_units"]) & 7
     if unit not in MILLIMETRES:
         raise InputDataError(f"the header of '{path}' has the unit of length {unit}, unknown; set it to 2 (millimetre)")
-    scaled = np.array(affine, dtype=np.float64)
+    return MILLIMETRES[unit]
+
+
+def _sform(header: Any) -> NDArray[np.float64]:
+    """The sform (4, 4) in the header's unit of length."""
     with np.errstate(all="ignore"):
-        scaled[:3] *= MILLIMETRES[unit]
-    return scaled
+        return np.array([*(header[f"srow_{axis}"] for axis in "xyz"), [0.0, 0.0, 0.0, 1.0]], dtype=np.float64)
+
+
+def _qform(header: Any) -> tuple[NDArray[np.float64] | None, str]:
+    """The qform (4, 4) in the header's unit of length, or what is wrong with it.
+
+    As nifti1_io.c has it: a quaternion longer than 1 by rounding is normalised, and qfac is the sign of pixdim[0].
+    """
+    b, c, d = (float(header[f"quatern_{part}"]) for part in "bcd")
+    qfac, *edges = (float(n) for n in header["pixdim"][:4])
+    squares = b * b + c * c + d * d
+    if not squares <= LONGEST**2:
+        return None, f"the quaternion ({b:.6g}, {c:.6g}, {d:.6g}) is longer than 1"
+    if not min(edges) > 0.0 or math.isnan(qfac):
+        return None, f"pixdim is {qfac:.6g}, {', '.join(f'{edge:.6g}' for edge in edges)}, not 1 or -1 and three lengths"
+    rest = 1.0 - squares
+    affine = np.eye(4)
+    turn = import_module("nibabel.quaternions").quat2mat([math.sqrt(rest) if rest > NO_ROOT else 0.0, b, c, d])
+    affine[:3, :3] = turn * np.array([edges[0], edges[1], edges[2] * (-1.0 if qfac < 0.0 else 1.0)])
+    affine[:3, 3] = [float(header[f"qoffset_{axis}"]) for axis in "xyz"]
+    return (affine, "") if np.isfinite(affine).all() else (None, "it is not finite")
 
 
 def write_label_image(path: Path | str, image: LabelImage) -> None:
