@@ -49,6 +49,7 @@ Widening = Literal[
     "ratio-only",
     "map-of-prior",
     "hardly-observed",
+    "points-unpaired",
     "motion-below-noise",
     "correlated",
     "several-minima",
