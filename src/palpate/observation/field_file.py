@@ -22,13 +22,15 @@ from palpate.images.readers.voxel_stream import opened
 from palpate.observation.measured_points import read_text
 
 Field = tuple[NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]
-MEMORY = 8 * 2**30  # bytes that reading a field may take
-OF_NIFTI, OF_ITK, OF_PARTS = 128, 128, 256  # bytes that a vector takes until it is a pair of points
-SHORTEST = 6  # bytes of a vector in a transform's file
+MEMORY = 8 * 2**30  # bytes that a field may take
+OF_VECTOR, OF_PART = 144, 32  # bytes, until it is a pair of points; and for each transform of a file
+IN_FILE = 24  # bytes of a vector, in most files of transforms
 MAX_HEADER = 2**20
 SIGNS = {"RAS": np.ones(3), "LPS": LPS_TO_RAS, "LAS": np.array([-1.0, 1.0, 1.0])}
 UNITS = {"mm": 1.0, "millimeter": 1.0, "millimeters": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "microns": 1e-3}
-INTENTS = {1006: "RAS", 1007: "LPS"}  # DISPVECT and VECTOR, as ITK has them
+# Axes by intents of NIfTI as ITK has them; and whether they are positions, by intent names of SPM and NiftyReg.
+INTENTS = {1006: "RAS", 1007: "LPS"}
+NAMES = {"Mapping": True, "NREG_TRANS 0": True, "NREG_TRANS 1": False}
 OF_FSL = (2006, 2007, 2008, 2009, 2016, 2017, 2018)
 ONE_TRANSFORM = re.compile(rb"_(?:double|float)_[23]_[23]\b")  # stands once for each in a file that ITK wrote
 ROUNDING = 1e-6  # of a voxel
@@ -49,7 +51,8 @@ def read_field(path: Path, axes: str) -> Field:
     except ImportError as error:
         raise ConfigurationError(f"'{path}' is read by SimpleITK: pip install simpleitk, or write .nii.gz") from error
     except (RuntimeError, ValueError) as error:
-        raise InputDataError(f"'{path}' cannot be read: {str(error).splitlines()[-1]}; export it again") from error
+        flaw = " ".join(str(error).splitlines()[-1:])
+        raise InputDataError(f"'{path}' cannot be read: {flaw}; export it again") from error
 
 
 def _signs(told: str, axes: str, path: Path) -> NDArray[np.float64]:
@@ -67,7 +70,12 @@ def _signs(told: str, axes: str, path: Path) -> NDArray[np.float64]:
     return SIGNS[told or axes]
 
 
-def _refuse_many(sizes: tuple[int, ...], of_each: int, path: Path) -> None:
+def _sha256(path: Path) -> str:
+    with opened(path) as file:
+        return file.sha256()
+
+
+def _refuse_many(sizes: tuple[int, ...], path: Path, of_each: int = OF_VECTOR) -> None:
     if np.prod([float(n) for n in sizes]) > MEMORY / of_each:
         raise InputDataError(
             f"'{path}' has {' x '.join(map(str, sizes))} vectors; resample it to {MEMORY // of_each} at most"
@@ -78,7 +86,7 @@ def _nifti(path: Path, axes: str) -> Field:
     def check(header: Any, sizes: tuple[int, ...], path: Path) -> None:
         if len(sizes) < 4 or [n for n in sizes[3:] if n != 1] != [3]:
             raise InputDataError(f"'{path}' has the sizes {list(sizes)}; export three axes and three components")
-        _refuse_many(sizes[:3], OF_NIFTI, path)
+        _refuse_many(sizes[:3], path)
         _nifti_kind(header, axes, path)
 
     content = nifti_content(path, check)
@@ -93,22 +101,16 @@ def _nifti(path: Path, axes: str) -> Field:
 def _nifti_kind(header: Any, axes: str, path: Path) -> tuple[NDArray[np.float64], bool]:
     """The signs that turn vectors to RAS, and whether they are positions, by what programs write as intent."""
     intent, name = int(header["intent_code"]), header["intent_name"].item().decode("latin-1")
-    if intent in OF_FSL:
+    name = f"{name} {float(header['intent_p1']):g}" if name.startswith("NREG") else name
+    if name in NAMES:
+        return _signs("RAS", axes, path), NAMES[name]
+    if intent in OF_FSL or name.startswith("NREG"):
         raise InputDataError(
-            f"'{path}' is a warp of FSL (intent {intent}), in its own scaled voxels; convert it by wb_command"
-            ' -convert-warpfield -from-fnirt ... -to-world, and state axes = "RAS"'
+            f"'{path}' holds no displacements in mm (intent {intent}, {printable(name)!r}); convert splines or"
+            " velocities of NiftyReg by reg_transform -disp, a warp of FSL by wb_command -convert-warpfield -from-fnirt"
+            ' ... -to-world, and state axes = "RAS"'
         )
-    if name == "Mapping":  # SPM's y_*.nii
-        return _signs("RAS", axes, path), True
-    if not name.startswith("NREG"):
-        return _signs(INTENTS.get(intent, ""), axes, path), False
-    kind = float(header["intent_p1"])
-    if name != "NREG_TRANS" or kind not in (0.0, 1.0):
-        raise InputDataError(
-            f"'{path}' holds {printable(name)} {kind:g} of NiftyReg, a spline or a velocity; convert it by"
-            " reg_transform -disp"
-        )
-    return _signs("RAS", axes, path), kind == 0.0
+    return _signs(INTENTS.get(intent, ""), axes, path), False
 
 
 def _image(path: Path, axes: str) -> Field:
@@ -119,9 +121,8 @@ def _image(path: Path, axes: str) -> Field:
     fields = {name.lower(): value for name, value in reversed(pairs)}  # the first of a name: behind them are voxels
     voxels = fields.get("data file") or fields.get("datafile") or fields.get("elementdatafile", "LOCAL")
     if voxels.upper() != "LOCAL":
-        with opened(beside(path, voxels)) as file:
-            digests.append(file.sha256())
-    units = set(re.findall(r"\w+", fields.get("space units", fields.get("distanceunits", "mm")).lower()))
+        digests.append(_sha256(beside(path, voxels)))
+    units = set(re.findall(r"\w+", fields.get("space units", fields.get("distanceunits", "")).lower())) or {"mm"}
     if len(units) != 1 or not units <= set(UNITS):
         raise InputDataError(f"'{path}' has lengths in {printable(str(sorted(units))[:60])}; export it in mm")
     turn = _of_nrrd(fields, axes, path) if head.startswith("NRRD") else np.diag(SIGNS[axes or "LPS"])
@@ -131,7 +132,7 @@ def _image(path: Path, axes: str) -> Field:
     n_axes, n_components = reader.GetDimension(), reader.GetNumberOfComponents()
     if (n_axes, n_components) != (3, 3):
         raise InputDataError(f"'{path}' has {n_axes} axes and {n_components} components; export three of both")
-    _refuse_many(reader.GetSize(), OF_ITK, path)
+    _refuse_many(reader.GetSize(), path)
     vectors, affine = _of_itk(reader.Execute())
     affine[:3] *= unit
     return vectors @ (unit * turn.T), affine, tuple(digests)
@@ -150,7 +151,8 @@ def _of_nrrd(fields: dict[str, str], axes: str, path: Path) -> NDArray[np.float6
         )
     if "measurement frame" not in fields:
         return np.diag(_signs(axes or ("LPS" if space == "LPS" else ""), axes, path))
-    _signs("its measurement frame" if axes else "RAS", axes, path)
+    if axes:
+        _signs("its measurement frame", axes, path)  # which refuses both
     columns = np.array([float(x) for x in re.findall(r"[^(),\s]+", fields["measurement frame"])]).reshape(3, 3)
     return np.asarray(SIGNS[space][:, None] * columns.T)
 
@@ -162,24 +164,24 @@ def _transform(path: Path, axes: str) -> Field:
     field: beyond it ITK takes its displacement for none.
     """
     sitk = import_module("SimpleITK")
-    with opened(path) as file:
-        digests, n_bytes = [file.sha256()], file.n_bytes
-    _refuse_many((n_bytes // SHORTEST,), OF_ITK, path)
+    digests = [_sha256(path)]
+    _refuse_many((path.stat().st_size // IN_FILE,), path)
     xfm = path.name.lower().endswith(".xfm")
     signs = _signs("" if xfm else "LPS", axes, path)  # SimpleITK takes the numbers of MNI tools for LPS, too
     parts = _of_xfm(path, digests) if xfm else _of_file(path)
     images = {
-        n: sitk.DisplacementFieldTransform(part).GetDisplacementField()
+        n: image
         for n, part in enumerate(parts)
         if part.GetName() == "DisplacementFieldTransform"
+        and all((image := sitk.DisplacementFieldTransform(part).GetDisplacementField()).GetSize())
     }
     if not images:
         raise InputDataError(
-            f"'{path}' holds no displacement field ({', '.join(part.GetName() for part in parts)}); write the transform"
-            " as a field on the first image's grid"
+            f"'{path}' holds no displacement field, or an inverted one ({', '.join(part.GetName() for part in parts)});"
+            " write the transform as a field on the first image's grid"
         )
     grid = min(reversed(images.values()), key=lambda image: float(np.prod(image.GetSpacing())))
-    _refuse_many(grid.GetSize(), OF_ITK if len(parts) == 1 else OF_PARTS, path)
+    _refuse_many(grid.GetSize(), path, OF_VECTOR + OF_PART * len(parts))
     whole, affine = _of_itk(grid if len(parts) == 1 else _on(parts, grid))
     for n, image in images.items() if len(parts) > 1 else ():
         moved, _ = _of_itk(_on(parts[n + 1 :], grid))  # by those that are applied before it
@@ -217,17 +219,13 @@ def _of_xfm(path: Path, digests: list[str]) -> list[Any]:
     """
     parts = []
     with TemporaryDirectory() as folder:
-        for section in re.split(r"(?m)^(?=Transform_Type)", read_text(path)[0])[1:]:
-            text = section
-            grid = re.search(r"(?<=Displacement_Volume)\s*=\s*([^;]*?)\s*;", text)
-            if grid and re.search(r"(?i)Invert_Flag\s*=\s*True", text):
-                raise InputDataError(f"'{path}' inverts its grid '{printable(grid[1])}'; write the inverse as a grid")
-            if grid:
-                with opened(beside(path, grid[1])) as file:
-                    digests.append(file.sha256())
-                text = text.replace(grid[0], f" = {beside(path, grid[1])};")
-            Path(folder, "part.xfm").write_text(f"MNI Transform File\n{text}", encoding="utf-8")
-            parts.insert(0, import_module("SimpleITK").ReadTransform(str(Path(folder, "part.xfm"))))
+        for n, text in enumerate(re.split(r"(?m)^(?=Transform_Type)", read_text(path)[0])[1:]):
+            part, grid = Path(folder, f"{n}.xfm"), re.search(r"Displacement_Volume\s*=\s*([^;]*?)\s*;", text)
+            volume = beside(path, grid[1]) if grid else path
+            digests += [_sha256(volume)] if grid else []
+            own = text.replace(grid[1], str(volume)) if grid else text
+            part.write_text(f"MNI Transform File\n{own}", encoding="utf-8")
+            parts.insert(0, import_module("SimpleITK").ReadTransform(str(part)))
     return parts
 
 

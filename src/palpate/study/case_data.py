@@ -23,9 +23,9 @@ class CaseData:
     """Measurements beside the images, of the later state with the number `state`; `file_after`: of a second list.
 
     `sd_mm`: standard deviation of each component's error, or `covariance_mm2` (3, 3) of a point's; `correlation_mm`:
-    length over which a field's errors are alike; `axes`: of the vectors of a field whose file does not tell. A force has
-    no file: `force_n` on `surface` (see `CaseLoad`) along `direction`, with `sd_n` and that of the load cell's offset,
-    `offset_sd_n`.
+    length over which a field's errors are alike; `axes`: of a field's vectors, where its file does not tell. A force
+    has no file: `force_n` on `surface` (see `CaseLoad`) along `direction`, with `sd_n` and that of the load cell's
+    offset, `offset_sd_n`.
     """
 
     kind: str = field(metadata=rule(choices=tuple(SOURCES)))
