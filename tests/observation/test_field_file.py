@@ -58,6 +58,7 @@ def nifti(folder, vectors, *, affine=AFFINE, unit="mm", four=False, ending=".nii
         ({"vectors": MOVED, "intent_code": 1006}, "RAS"),
         ({"vectors": MOVED * LPS, "intent_code": 1007}, ""),  # ITK, ANTs, greedy
         ({"vectors": MOVED * LPS, "intent_code": 1007, "ending": ".nii"}, "LPS"),
+        ({"vectors": MOVED, "intent_code": 1007}, "RAS"),  # Connectome Workbench
         ({"vectors": MOVED, "four": True}, "RAS"),  # MRtrix
         ({"vectors": MOVED * LPS, "four": True, "kind": nibabel.Nifti2Image}, "LPS"),
         ({"vectors": MOVED, "intent_code": 1007, "intent_name": "NREG_TRANS", "intent_p1": 1.0}, ""),
@@ -105,7 +106,6 @@ def test_nifti_is_read_as_its_header_says(tmp_path, what, axes):
     [
         ({"vectors": MOVED, "four": True}, "", 'axes = "RAS"'),
         ({"vectors": MOVED, "intent_code": 1006}, "LPS", "in RAS, as it says"),
-        ({"vectors": MOVED, "intent_code": 1007}, "RAS", "in LPS, as it says"),
         ({"vectors": MOVED, "intent_code": 1007, "intent_name": "NREG_TRANS", "intent_p1": 2.0}, "", "reg_transform"),
         ({"vectors": MOVED, "intent_code": 1007, "intent_name": "NREG_TRANS", "intent_p1": 4.0}, "", "reg_transform"),
         ({"vectors": MOVED, "intent_code": 2006}, "RAS", "warp of FSL"),

@@ -28,9 +28,8 @@ IN_FILE = 24  # bytes of a vector, in most files of transforms
 MAX_HEADER = 2**20
 SIGNS = {"RAS": np.ones(3), "LPS": LPS_TO_RAS, "LAS": np.array([-1.0, 1.0, 1.0])}
 UNITS = {"mm": 1.0, "millimeter": 1.0, "millimeters": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "microns": 1e-3}
-# Axes by intents of NIfTI as ITK has them; and whether they are positions, by intent names of SPM and NiftyReg.
-INTENTS = {1006: "RAS", 1007: "LPS"}
-NAMES = {"Mapping": True, "NREG_TRANS 0": True, "NREG_TRANS 1": False}
+DISPVECT, VECTOR = 1006, 1007  # intents of NIfTI, which ITK has in RAS and LPS; Workbench writes the second in RAS, too
+NAMES = {"Mapping": True, "NREG_TRANS 0": True, "NREG_TRANS 1": False}  # of SPM and NiftyReg: whether of positions
 OF_FSL = (2006, 2007, 2008, 2009, 2016, 2017, 2018)
 ONE_TRANSFORM = re.compile(rb"_(?:double|float)_[23]_[23]\b")  # stands once for each in a file that ITK wrote
 ROUNDING = 1e-6  # of a voxel
@@ -110,7 +109,8 @@ def _nifti_kind(header: Any, axes: str, path: Path) -> tuple[NDArray[np.float64]
             " velocities of NiftyReg by reg_transform -disp, a warp of FSL by wb_command -convert-warpfield -from-fnirt"
             ' ... -to-world, and state axes = "RAS"'
         )
-    return _signs(INTENTS.get(intent, ""), axes, path), False
+    told = {DISPVECT: "RAS", VECTOR: axes or "LPS"}.get(intent, "")
+    return _signs(told, axes, path), False
 
 
 def _image(path: Path, axes: str) -> Field:
