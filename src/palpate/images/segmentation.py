@@ -97,8 +97,10 @@ def segment(image: LabelImage, tissues: tuple[Tissue, ...]) -> Segmentation:
     labels = np.unique(np.concatenate([np.unique(layer) for layer in image.labels]))
     orphans = [int(label) for label in labels if int(label) not in owner]
     if orphans and not rest:
+        scaled = "".join(f". {each.message}" for each in image.findings if each.code == "scaled-labels")
         raise InputDataError(
             f"labels {orphans[:10]} belong to no tissue; name them in a tissue, or give one tissue label = 'remaining'"
+            f"{scaled}"
         )
     table = np.array([owner.get(int(label), rest[0] if rest else -1) for label in labels], dtype=np.int16)
     described = []

@@ -46,8 +46,8 @@ def main(arguments: list[str]) -> None:
             image_format = own_format(name)
             for module in image_format.needless:
                 sys.modules[module] = cast("ModuleType", None)  # whoever imports it is told that it is not installed
-            stored = image_format.stored(path, grid)
-            values = np.asfortranarray(reduced(stored.values, path, kind=kind))
+            stored = reduced(image_format.stored(path, grid), path, kind=kind)
+            values = np.asfortranarray(stored.values)
         except PalpateError as error:
             _send(pipe, {"error": type(error).__name__, "message": str(error)})
         except MemoryError:

@@ -15,12 +15,12 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import MAX_NAME, NamedLabel, hex_colour, printable
 from palpate.images.readers.dicom_dataset import LPS_AFFINE, Series, read_dataset, sentences, series_beside
 from palpate.images.readers.merged_masks import Mask, merged
+from palpate.images.readers.reference_grid import on_grid
 from palpate.images.readers.registry import StoredImage
 from palpate.images.readers.values import to_canonical
 from palpate.images.readers.voxel_stream import check_size
 
 MOST_SEGMENTS = 1000
-SAME_PLACE = 0.01  # of a voxel
 
 
 def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
@@ -74,16 +74,9 @@ def _completed(image: StoredImage, series: Series | None) -> StoredImage:
     """The image with the slices that the file leaves out as empty, which only its series can tell."""
     if series is not None:
         labels, affine = to_canonical(image.values, image.affine)
-        place = np.linalg.inv(series.grid.affine) @ affine
-        first = np.rint(place[:3, 3]).astype(int)
-        same = np.eye(4)
-        same[:3, 3] = first
-        inside = (first >= 0).all() and (first + labels.shape <= series.grid.shape).all()
-        if inside and np.abs(place - same).max() < SAME_PLACE:
-            whole = np.zeros(series.grid.shape, dtype=labels.dtype)
-            whole[tuple(slice(f, f + n) for f, n in zip(first, labels.shape, strict=True))] = labels
-            digests = {**image.digests, **({"series": series.sha256} if series.sha256 else {})}
-            return StoredImage(whole, series.grid.affine, image.names, digests, image.findings)
+        whole = on_grid(replace(image, values=labels, affine=affine), series.grid)
+        if whole is not None:
+            return replace(whole, digests={**image.digests, **({"series": series.sha256} if series.sha256 else {})})
     labels = image.values
     if not (labels[0].any() and labels[-1].any()):
         return image

@@ -1,110 +1,140 @@
-"""MetaImage files (.mha, .mhd), as ITK writes and reads them: world coordinates are LPS mm.
+"""MetaImage files (.mha, .mhd), as ITK writes them: world coordinates are LPS mm.
 
-Format: https://itk.org/Wiki/MetaIO/Documentation; a row of TransformMatrix is the direction of one axis. Nothing but
-size, type, place and packing is taken from the header; names and comments in it never leave this file.
+Format: https://itk.org/Wiki/MetaIO/Documentation; a row of TransformMatrix is the direction of one axis. What neither
+places nor decodes voxels (comments, copies of DICOM fields) never leaves this file.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.images.label_image import LPS_TO_RAS
-from palpate.images.named_labels import printable
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
-from palpate.images.readers.text_header import TextHeader, header_line, voxels_of
-from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to_skip, opened, read_block
+from palpate.images.readers.text_header import StoredArray, header_lines, numbers_in, refused, voxels_of
+from palpate.images.readers.voxel_stream import VoxelBlock, opened, read_block
 
-SYNONYMS = {
-    "rotation": "transformmatrix",
-    "orientation": "transformmatrix",
-    "position": "offset",
-    "origin": "offset",
-    "elementbyteordermsb": "binarydatabyteordermsb",
+SYNONYMS = {"Rotation": "TransformMatrix", "Orientation": "TransformMatrix", "Position": "Offset", "Origin": "Offset"}
+BIG_ENDIAN = ("BinaryDataByteOrderMSB", "ElementByteOrderMSB")
+TYPES = {"CHAR": "i1", "SHORT": "i2", "INT": "i4", "LONG": "i4", "LONG_LONG": "i8", "FLOAT": "f4", "DOUBLE": "f8"}
+TYPES |= {f"U{name}": f"u{code[1]}" for name, code in TYPES.items() if code[0] == "i"}
+LAST = "ElementDataFile"
+USED = {
+    "NDims",
+    "DimSize",
+    "TransformMatrix",
+    "Offset",
+    "ElementSpacing",
+    "ElementSize",
+    "DistanceUnits",
+    "ElementType",
 }
-TYPES = {
-    "MET_CHAR": "i1",
-    "MET_UCHAR": "u1",
-    "MET_SHORT": "i2",
-    "MET_USHORT": "u2",
-    "MET_INT": "i4",
-    "MET_UINT": "u4",
-    "MET_LONG": "i4",
-    "MET_ULONG": "u4",
-    "MET_LONG_LONG": "i8",
-    "MET_ULONG_LONG": "u8",
-    "MET_FLOAT": "f4",
-    "MET_DOUBLE": "f8",
-}
-LAST = "elementdatafile"
+USED |= {"ElementNumberOfChannels", "BinaryData", "CompressedData", "HeaderSize", LAST, *BIG_ENDIAN}
 
 
 def read_metaimage(path: Path) -> StoredImage:
     """Read one image of three axes from `path`; raises `InputDataError` with a sentence for whatever is wrong."""
+    array = metaimage_content(path)
+    return StoredImage(array.layers(path, 1)[0], array.affine, digests=array.digests)
+
+
+def metaimage_content(path: Path) -> StoredArray:
+    """Voxels of three axes in space and any others, of which the channels are the first.
+
+    Raises `InputDataError` with a sentence for whatever is wrong.
+    """
     with opened(path) as file:
-        fields: dict[str, str] = {}  # in lower case, up to the one that says where the voxels are
-        while LAST not in fields:
-            line = header_line(file, path)
-            name, equals, value = (line or "").partition("=")
-            if line is None or not equals or not re.fullmatch(r"\w+", name.strip(), re.ASCII):
-                raise InputDataError(
-                    f"'{path}' does not begin as a MetaImage file does; export the image as MetaImage or NIfTI"
-                )
-            field = SYNONYMS.get(name.strip().lower(), name.strip().lower())
-            if field in fields:
-                raise InputDataError(f"the header of '{path}' has '{field[:60]}' twice; export the image again")
-            fields[field] = value.strip()
-        header = TextHeader(fields, path)
-        block = _block(header)
-        header.need("transformmatrix", "so left and right are unknown; export the image with its orientation")
-        rows = header.numbers("transformmatrix", 9).reshape(3, 3)
-        sizes = "elementspacing" if "elementspacing" in fields else "elementsize"
-        header.need(sizes, "so its scale is unknown; export it again")
-        spacing = header.numbers(sizes, 3)
-        if not (spacing > 0.0).all():
-            raise header.refused(
-                sizes,
-                "it must be positive: programs take a sign there for a mirror or not; turn the axis in TransformMatrix,"
-                " or export the image again",
-            )
-        affine = np.eye(4)  # ITK takes the world of every MetaImage for LPS, whatever AnatomicalOrientation says
-        affine[:3, :3] = LPS_TO_RAS[:, None] * rows.T * spacing
-        affine[:3, 3] = LPS_TO_RAS * header.numbers("offset", 3, fields.get("offset", "0 0 0"))
+        fields = _fields(header_lines(file, path, rf"\s*{LAST}\s*[=:]"), path)
+        channels, *_ = _counts(fields, "ElementNumberOfChannels", path, "1")
+        sizes = _counts(fields, "DimSize", path)
+        affine = _affine(fields, len(sizes), path)
+        kind = fields.get("ElementType", "").removeprefix("MET_")
+        if kind not in TYPES:
+            advice = "only integers and floats of up to 64 bits are read: export one channel"
+            raise refused(path, "ElementType", kind, advice)
+        order = ">" if any(_flag(fields, name, path) for name in BIG_ENDIAN) else "<"
+        packed, binary = _flag(fields, "CompressedData", path), _flag(fields, "BinaryData", path, default="True")
         beside = None if fields[LAST].upper() == "LOCAL" else fields[LAST]
+        skip = int(_numbers(fields, "HeaderSize", path, default=[0.0])[0])
+        skip -= file.tell() if beside is None and skip > 0 else 0  # it counts from the start of the file
+        if skip < -1 or (skip and packed):
+            raise refused(path, "HeaderSize", fields["HeaderSize"], "no voxels begin there: export the image again")
+        packing = "zlib" if packed else "raw" if binary else "ascii"
+        block = VoxelBlock((channels, *sizes), np.dtype(order + TYPES[kind]), packing, skip)
         values, digests = voxels_of(file, path, beside, lambda rest: read_block(rest, block, path))
-    return StoredImage(values.reshape(block.shape[:3], order="F"), affine + 0.0, digests=digests)  # no minus zero
+    return StoredArray(values, affine, (0, *range(4, values.ndim)), digests)
 
 
-def _block(header: TextHeader) -> VoxelBlock:
-    sizes, channels = header.counts("dimsize"), header.fields.get("elementnumberofchannels", "1")
-    if header.need("ndims") != str(len(sizes)):
-        raise header.refused("ndims", "DimSize disagrees with it: export the image again")
-    if len(sizes) != 3 or channels != "1":
+def _fields(lines: list[str], path: Path) -> dict[str, str]:
+    """What places and decodes voxels, by its name; a field may be there twice, or under two names, if both agree."""
+    fields: dict[str, str] = {}
+    for line in lines:
+        name, *value = (part.strip() for part in re.split("[=:]", line, maxsplit=1))
+        name = SYNONYMS.get(name, name)
+        if name not in USED or not value:
+            continue
+        first, second = fields.setdefault(name, value[0]).split(), value[0].split()
+        if first != second and not (numbers_in(first) and numbers_in(first) == numbers_in(second)):
+            raise refused(path, name, fields[name], "it has it twice, with another value then; leave the right one")
+    if LAST not in fields:
         raise InputDataError(
-            f"'{header.path}' has the sizes {sizes[:16]} and {printable(channels[:20])} channels, but an image of three"
-            " axes and one channel is needed; extract one volume (a time point, a channel)"
+            f"'{path}' does not begin as a MetaImage file does; export the image as MetaImage or NIfTI"
         )
-    code = TYPES.get(header.need("elementtype"))
-    if code is None or not _flag(header, "binarydata", default=True):
-        advice = "only voxels of binary integers and floats of up to 64 bits are read: export the image again"
-        raise header.refused("elementtype", advice)
-    dtype = np.dtype(code).newbyteorder(">" if _flag(header, "binarydatabyteordermsb") else "<")
-    packing = "zlib" if _flag(header, "compresseddata") else "raw"
-    text = header.fields.get("headersize", "0")
-    skip = bytes_to_skip(text, packing)
-    if skip is None or (packing != "raw" and text != "0"):
-        raise header.refused("headersize", f"HeaderSize lies between 0 and {MAX_OFFSET}: export it again")
-    return VoxelBlock(sizes, dtype, packing, skip)
+    return fields
 
 
-def _flag(header: TextHeader, field: str, *, default: bool = False) -> bool:
-    value = header.fields.get(field, str(default)).lower()
-    if value not in ("true", "false", "1", "0"):
-        raise header.refused(field, "it is not True or False: correct it")
-    return value in ("true", "1")
+def _affine(fields: Mapping[str, str], n: int, path: Path) -> NDArray[np.float64]:
+    """Index -> RAS mm; ITK takes the world of every MetaImage for LPS, whatever AnatomicalOrientation says."""
+    if fields.get("NDims") != str(n) or n < 3:
+        raise refused(path, "NDims", fields.get("NDims"), f"three axes are needed, DimSize has {n}: export it again")
+    rows = np.reshape(_numbers(fields, "TransformMatrix", path, n * n), (n, n))
+    name = "ElementSpacing" if "ElementSpacing" in fields else "ElementSize"
+    spacing = np.array(_numbers(fields, name, path, n))
+    if not (spacing > 0.0).all():
+        advice = "it must be positive: programs take a sign there for a mirror or not; turn the axis in TransformMatrix"
+        raise refused(path, name, fields[name], advice)
+    if rows[:3, 3:].any() or rows[3:, :3].any():
+        raise refused(path, "TransformMatrix", fields["TransformMatrix"], "time leans into space: extract one volume")
+    if fields.get("DistanceUnits", "mm") not in ("mm", "?"):
+        raise refused(path, "DistanceUnits", fields["DistanceUnits"], "most programs pass over it: state lengths in mm")
+    affine, origin = np.eye(4), _numbers(fields, "Offset", path, n, default=[0.0] * n)
+    with np.errstate(over="ignore"):  # what is not finite is refused later, with its numbers
+        affine[:3, :3] = LPS_TO_RAS[:, None] * rows[:3, :3].T * spacing[:3]
+    affine[:3, 3] = LPS_TO_RAS * origin[:3]
+    return affine + 0.0  # no minus zero
+
+
+def _counts(fields: Mapping[str, str], name: str, path: Path, default: str = "missing") -> list[int]:
+    words = fields.get(name, default).split()
+    sizes = [int(word) for word in words if word.isascii() and word.isdigit() and len(word) <= 20]
+    if len(sizes) != len(words) or not sizes or min(sizes) < 1:
+        raise refused(path, name, " ".join(words), "it must be positive counts: export the image again")
+    return sizes
+
+
+def _numbers(
+    fields: Mapping[str, str], name: str, path: Path, n: int | None = None, *, default: list[float] | None = None
+) -> list[float]:
+    """The numbers of a field, `n` of them where that is known."""
+    if name not in fields and default is not None:
+        return default
+    found = numbers_in(fields.get(name, "").split())
+    if not found or len(found) != (n or len(found)):
+        advice = f"{n or 'plain'} numbers are needed; without them an image has no place: export it again, with them"
+        raise refused(path, name, fields.get(name, "missing"), advice)
+    return found
+
+
+def _flag(fields: Mapping[str, str], name: str, path: Path, *, default: str = "False") -> bool:
+    value = fields.get(name, default)
+    if value.lower() not in ("true", "false", "1", "0"):
+        raise refused(path, name, value, "it is not True or False: correct it")
+    return value.lower() in ("true", "1")
 
 
 register(ImageFormat("MetaImage", (".mha", ".mhd"), read_metaimage))

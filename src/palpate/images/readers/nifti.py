@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
-from palpate.findings import Finding
 from palpate.images.label_image import LPS_TO_RAS, LabelImage, VoxelGrid, corners_apart
 from palpate.images.readers.nifti_extension import extension_names
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.voxel_stream import (
     MAX_OFFSET,
+    MAX_RATIO,
     VoxelBlock,
     check_size,
     gzip_stream,
@@ -37,7 +37,6 @@ from palpate.images.readers.voxel_stream import (
 MILLIMETRES = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}  # xyzt_units: unknown, metre, millimetre, micrometre
 HEADERS = {348: "Nifti1Header", 540: "Nifti2Header"}  # by nibabel, which is imported when an image comes
 MAGIC = {348: b"n+1\0", 540: b"n+2\0\r\n\032\n"}
-PAIR = (".hdr", ".img", ".hdr.gz", ".img.gz")
 VECTORS = {1005: "symmetric matrices", 1006: "displacements", 1007: "vectors", 2003: "colours", 2004: "colours"}
 LONGEST = 1.001  # of a quaternion, whose length is 1 but for rounding
 NO_ROOT = 1e-7  # nifti1_io.c: less than this of 1 - b^2 - c^2 - d^2 is rounding, and the turn is by 180 degrees
@@ -73,11 +72,6 @@ def nifti_content(path: Path, check: Callable[[Any, tuple[int, ...], Path], None
     `check` gets the header, the sizes of its axes and `path` before memory is taken, and raises where they are not what
     is read. Raises `InputDataError` for a file that is damaged, or is no NIfTI file in one piece.
     """
-    if path.name.lower().endswith(PAIR):
-        raise InputDataError(
-            f"'{path}' is one half of a .hdr/.img pair (NIfTI or Analyze), which is not read; convert both to one .nii.gz"
-            " file (3D Slicer, fslchfiletype, mri_convert), and see there that left and right are right"
-        )
     with opened(path) as file:
         zipped = file.peek(2)[:2] == b"\x1f\x8b"
         if zipped != path.name.lower().endswith(".gz"):
@@ -100,7 +94,8 @@ def nifti_content(path: Path, check: Callable[[Any, tuple[int, ...], Path], None
         header = getattr(import_module("nibabel"), HEADERS[used])(content, endianness=sign, check=False)
         block, (slope, intercept) = _block(header, path)
         check(header, block.shape, path)
-        check_size(block.shape, block.skip + block.n_bytes, path, available=file.n_bytes, packed=zipped)
+        packed = MAX_RATIO["gzip" if zipped else "raw"]
+        check_size(block.shape, block.skip + block.n_bytes, path, available=file.n_bytes, packed=packed)
         between = read_exactly(stream, block.skip - used, path).tobytes()
         values = read_voxels(stream, block, path)
         sha256 = file.sha256()
@@ -143,8 +138,8 @@ def _three_axes(header: Any, sizes: tuple[int, ...], path: Path) -> None:
         intent = int(header["intent_code"])
         of = f" of {VECTORS[intent]} (intent {intent})" if intent in VECTORS else ""
         raise InputDataError(
-            f"'{path}' has the sizes {list(sizes)}{of}, but an image of three axes is needed; extract one volume (a time"
-            " point, a channel) or stack the slices"
+            f"'{path}' has the sizes {list(sizes)}{of}, but an image of three axes is needed; extract one volume (a"
+            " time point, a channel) or stack the slices"
         )
 
 
@@ -205,7 +200,10 @@ def _qform(header: Any) -> tuple[NDArray[np.float64] | None, str]:
     if not squares <= LONGEST**2:
         return None, f"the quaternion ({b:.6g}, {c:.6g}, {d:.6g}) is longer than 1"
     if not min(edges) > 0.0 or math.isnan(qfac):
-        return None, f"pixdim is {qfac:.6g}, {', '.join(f'{edge:.6g}' for edge in edges)}, not 1 or -1 and three lengths"
+        return (
+            None,
+            f"pixdim is {qfac:.6g}, {', '.join(f'{edge:.6g}' for edge in edges)}, not 1 or -1 and three lengths",
+        )
     rest = 1.0 - squares
     affine = np.eye(4)
     turn = import_module("nibabel.quaternions").quat2mat([math.sqrt(rest) if rest > NO_ROOT else 0.0, b, c, d])

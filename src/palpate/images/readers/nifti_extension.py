@@ -13,7 +13,7 @@ from xml.parsers import expat
 
 from palpate.errors import InputDataError
 from palpate.images.named_labels import MAX_NAME, NamedLabel, printable
-from palpate.images.readers.text_header import unit_colour
+from palpate.images.readers.segments import unit_colour
 
 ROOT = "CaretExtension"
 LABEL = (ROOT, "VolumeInformation", "LabelTable", "Label")

@@ -1,160 +1,147 @@
 """NRRD files (.nrrd, .nhdr) and the segmentations of 3D Slicer (.seg.nrrd), with every size checked before it is used.
 
-Format: https://teem.sourceforge.net/nrrd/format.html, version 5. Only what places voxels in the world is kept of the
-header, and of a segmentation the names, colours, values and layers of its segments; free keys never leave this file.
+Format: https://teem.sourceforge.net/nrrd/format.html, version 5. pynrrd parses the header. Only what places voxels is
+kept of it, and of a segmentation the names, colours, values, layers and place of its segments.
 """
 
 from __future__ import annotations
 
+import io
 import re
+from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.images.input_file import InputFile
+from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import printable
+from palpate.images.readers.reference_grid import uncropped
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.segments import flattened, segments_of
-from palpate.images.readers.text_header import TextHeader, header_line, voxels_of
-from palpate.images.readers.voxel_stream import MAX_OFFSET, VoxelBlock, bytes_to_skip, opened, read_block
+from palpate.images.readers.text_header import StoredArray, header_lines, refused, voxels_of
+from palpate.images.readers.voxel_stream import VoxelBlock, opened, read_block
 
-SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}
-RAS_SIGNS = {  # of the three world axes
-    "right-anterior-superior": (1, 1, 1),
-    "ras": (1, 1, 1),
-    "left-anterior-superior": (-1, 1, 1),
-    "las": (-1, 1, 1),
-    "left-posterior-superior": (-1, -1, 1),
-    "lps": (-1, -1, 1),
-}
-TYPES = {
-    name: code
-    for code, names in {
-        "i1": "signed char,int8,int8_t",
-        "u1": "uchar,unsigned char,uint8,uint8_t",
-        "i2": "short,short int,signed short,signed short int,int16,int16_t",
-        "u2": "ushort,unsigned short,unsigned short int,uint16,uint16_t",
-        "i4": "int,signed int,int32,int32_t",
-        "u4": "uint,unsigned int,uint32,uint32_t",
-        "i8": "longlong,long long,long long int,signed long long,signed long long int,int64,int64_t",
-        "u8": "ulonglong,unsigned long long,unsigned long long int,uint64,uint64_t",
-        "f4": "float",
-        "f8": "double",
-    }.items()
-    for name in names.split(",")
-}
-PACKINGS = {"raw": "raw", "gzip": "gzip", "gz": "gzip"}
+RAS_SIGNS = {"right-anterior-superior": (1, 1, 1), "left-anterior-superior": (-1, 1, 1)}
+RAS_SIGNS |= {"left-posterior-superior": (-1, -1, 1), "ras": (1, 1, 1), "las": (-1, 1, 1), "lps": (-1, -1, 1)}
+PACKINGS = {"raw": "raw", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2"}
+PACKINGS |= dict.fromkeys(("ascii", "text", "txt"), "ascii")
 MILLIMETRES = {"mm": 1.0, "millimeter": 1.0, "m": 1000.0, "cm": 10.0, "um": 0.001, "": 1.0}
-VECTOR = re.compile(r"none|\(([^()]*)\)", re.IGNORECASE)
+SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}
+VECTORS = ("space directions", "space origin")
+MAX_LINES = 9999  # between header and voxels
 
 
-def read_nrrd(path: Path) -> StoredImage:
+def read_nrrd(path: Path, grid: VoxelGrid | None = None) -> StoredImage:
     """Read one image of three axes, or a segmentation with its layers, from `path`.
 
-    Layers that do not overlap become one label image. Raises `InputDataError` with a sentence for whatever is wrong.
+    Layers that do not overlap become one label image; a segmentation that was cropped is completed by what it says of
+    its reference image, else by `grid`. Raises `InputDataError` with a sentence for whatever is wrong.
+    """
+    array, fields = nrrd_content(path)
+    segments = segments_of(fields, path)
+    layers = array.layers(path, None if segments else 1)
+    if not segments:
+        return StoredImage(layers[0], array.affine, digests=array.digests)
+    labels, names = flattened(layers, segments, path)
+    return uncropped(StoredImage(labels, array.affine, names, array.digests), fields, grid, path)
+
+
+def nrrd_content(path: Path) -> tuple[StoredArray, dict[str, Any]]:
+    """Voxels of three axes in space and any others, and the header's fields and keys, which pynrrd parsed.
+
+    Raises `InputDataError` with a sentence for whatever is wrong.
     """
     with opened(path) as file:
-        header, keys = _header(file, path)
-        block, (affine, list_axes) = _block(header), _place(header)
-        text = header.fields.get("line skip", "0")
-        if not (text.isascii() and text.isdigit() and len(text) <= 4):
-            raise header.refused("line skip", "it must lie between 0 and 9999; export the image again")
+        fields = _fields(header_lines(file, path, "$"), path)
+        (block, lines), (affine, beside) = _block(fields, path), _place(fields, path)
 
         def voxels(rest: InputFile) -> NDArray[Any]:
             """Those behind the lines that are to be skipped."""
-            for _ in range(int(text)):
-                header_line(rest, path)
+            for _ in range(lines):
+                header_lines(rest, path, "")
             return read_block(rest, block, path)
 
-        values, digests = voxels_of(file, path, header.fields.get("data file"), voxels)
-    segments = segments_of(keys, path)
-    lists = [k for k in list_axes if values.shape[k] > 1]
-    if len(lists) > 1 or (lists and not segments):
-        raise InputDataError(
-            f"'{path}' has the sizes {list(values.shape)}, but an image of three axes is needed; extract one volume (a"
-            " time point, a channel)"
-        )
-    keep = lists[:1]
-    squeezed = np.squeeze(values, axis=tuple(k for k in list_axes if k not in keep))
-    if not segments:
-        return StoredImage(squeezed, affine, digests=digests)
-    layers = np.moveaxis(squeezed, keep[0], 0) if keep else squeezed[None]
-    labels, names = flattened(layers, segments, path)
-    return StoredImage(labels, affine, names, digests)
+        values, digests = voxels_of(file, path, fields.get("data file"), voxels)
+    return StoredArray(values, affine, beside, digests), fields
 
 
-def _header(file: BinaryIO, path: Path) -> tuple[TextHeader, dict[str, str]]:
-    """The header's fields, and its key-values."""
-    first = header_line(file, path) or ""
-    if not re.fullmatch(r"NRRD000[1-5]\s*", first):
+def _fields(lines: list[str], path: Path) -> dict[str, Any]:
+    """The header's fields and keys, by pynrrd; one may be there twice, if both agree."""
+    if not lines or not re.fullmatch(r"NRRD000[1-5]", lines[0]):
         raise InputDataError(f"'{path}' does not begin as an NRRD file does; export the image as NRRD or NIfTI")
-    fields: dict[str, str] = {}
-    keys: dict[str, str] = {}
-    while line := header_line(file, path):
-        if line.startswith("#"):
-            continue
-        field, colon, value = line.partition(":")
-        if not colon:
-            raise InputDataError(
-                f"the header of '{path}' has the line '{printable(line[:60])}'; export the image again"
-            )
-        known, name = (keys, field) if value.startswith("=") else (fields, field.strip().lower())
-        name = SYNONYMS.get(name, name)
-        if name in known:
-            raise InputDataError(f"the header of '{path}' has '{printable(name[:60])}' twice; export the image again")
-        known[name] = value[1:] if known is keys else value.strip()
-    return TextHeader(fields, path), keys
+    plain = []
+    for line in lines[1:]:
+        name, colon, value = line.partition(":")
+        if not value.startswith("="):  # else it is a key
+            name = SYNONYMS.get(name.strip().lower(), name.strip().lower())
+        if name in VECTORS:  # without blanks in them; a bare nan, for an axis that is not in space, is none
+            vectors = re.findall(r"\([^()]*\)|[^\s()]+", value.lower())
+            value = " ".join("none" if each == "nan" else re.sub(r"\s+", "", each) for each in vectors)
+        plain.append(f"{name}{colon}{value.strip()}")
+    try:
+        fields: dict[str, Any] = import_module("nrrd").read_header([lines[0], *dict.fromkeys(plain)])
+    except Exception as error:  # pynrrd raises what numpy and Python raise
+        flaw = printable(str(error)[:100])
+        raise InputDataError(f"the header of '{path}' is no NRRD header: {flaw}; export the image again") from error
+    for name in ("dimension", "sizes", "type", "encoding"):
+        if name not in fields:
+            raise refused(path, name, "missing", "export the image again")
+    if min(fields["sizes"], default=0) < 1 or len(fields["sizes"]) != fields["dimension"]:
+        raise refused(path, "sizes", fields["sizes"], f"{fields['dimension']} positive counts are needed: export again")
+    return fields
 
 
-def _block(header: TextHeader) -> VoxelBlock:
-    sizes = header.counts("sizes")
-    if header.need("dimension") != str(len(sizes)) or len(sizes) > 16:
-        raise header.refused("dimension", f"but {len(sizes)} sizes; export the image again")
-    code = TYPES.get(header.need("type").lower())
-    if code is None:
-        raise header.refused("type", "only integers and floats of up to 64 bits are read: export one channel")
-    packing = PACKINGS.get(header.need("encoding").lower())
-    if packing is None:
-        raise header.refused("encoding", "only raw and gzip are read; save the image with one of them")
-    endian = header.fields.get("endian", "little" if code[1] == "1" else "").lower()
-    if endian not in ("little", "big"):
-        raise header.refused("endian", "it must be little or big; export the image again")
-    skip = bytes_to_skip(header.fields.get("byte skip", "0"), packing)
-    if skip is None:
-        raise header.refused("byte skip", f"it must lie between 0 and {MAX_OFFSET}; export the image again")
-    return VoxelBlock(sizes, np.dtype(code).newbyteorder("<" if endian == "little" else ">"), packing, skip)
+def _block(fields: Mapping[str, Any], path: Path) -> tuple[VoxelBlock, int]:
+    """How the voxels are stored, and how many lines stand before them."""
+    packing = PACKINGS.get(fields["encoding"].lower(), "")
+    if not packing:
+        advice = "raw, gzip, bzip2 and ascii are read; save the image with gzip"
+        raise refused(path, "encoding", fields["encoding"], advice)
+    one = {name: str(fields[name]).lower() for name in ("type", "endian") if name in fields}
+    one |= {"endian": "little"} if packing == "ascii" else {}
+    try:
+        none = {**one, "encoding": "raw", "dimension": 1, "sizes": np.zeros(1, dtype=int)}
+        dtype = import_module("nrrd").read_data(none, io.BytesIO()).dtype
+    except Exception as error:
+        field = "endian" if "endian" in str(error) else "type"
+        advice = "integers and floats of up to 64 bits, little or big, are read: export one channel"
+        raise refused(path, field, fields.get(field, "missing"), advice) from error
+    lines = fields.get("line skip", 0)
+    if not 0 <= lines <= MAX_LINES:
+        raise refused(path, "line skip", lines, f"it must lie between 0 and {MAX_LINES}; export the image again")
+    return VoxelBlock(tuple(int(n) for n in fields["sizes"]), dtype, packing, fields.get("byte skip", 0)), lines
 
 
-def _place(header: TextHeader) -> tuple[NDArray[np.float64], tuple[int, ...]]:
-    """The affine (4, 4) index -> RAS mm of the axes in space, and which axis, if any, lists layers or channels.
+def _place(fields: Mapping[str, Any], path: Path) -> tuple[NDArray[np.float64], tuple[int, ...]]:
+    """The affine (4, 4) index -> RAS mm of the axes in space, and the axes that are not in it (layers, time).
 
     By `space`, `space directions` and `space origin`; a missing origin is zero, as ITK has it.
     """
-    path = header.path
-    signs = RAS_SIGNS.get(header.fields.get("space", "").lower())
-    if signs is None or "space directions" not in header.fields:
-        raise InputDataError(
-            f"the header of '{path}' does not say where right, front and head are (its space is"
-            f" '{printable(header.fields.get('space', 'missing')[:40])}'); export it with its orientation (LPS, RAS)"
-        )
-    vectors = list(VECTOR.finditer(header.fields["space directions"]))
-    in_space = [k for k, vector in enumerate(vectors) if vector[1] is not None]
-    if str(len(vectors)) != header.need("dimension") or len(in_space) != 3:
-        raise header.refused("space directions", "an image of three axes is needed; extract one volume")
-    affine = np.eye(4)
-    for column, k in enumerate(in_space):
-        affine[:3, column] = header.numbers("space directions", 3, vectors[k][1].replace(",", " "))
-    origin = VECTOR.fullmatch(header.fields.get("space origin", "(0,0,0)"))
-    affine[:3, 3] = header.numbers("space origin", 3, ((origin and origin[1]) or "").replace(",", " "))
-    units = set(re.findall(r'"([^"]*)"', header.fields.get("space units", '"mm"')))
+    space = str(fields.get("space", "missing")).lower()
+    timed = space.endswith("-time") or len(space) == 4
+    signs, n = RAS_SIGNS.get(space.removesuffix("-time")[: 3 if len(space) == 4 else None]), 3 + timed
+    if signs is None or "space directions" not in fields:
+        advice = "it does not say where right, front and head are; export it with its orientation (LPS, RAS)"
+        raise refused(path, "space", space, advice)
+    vectors, origin = fields["space directions"], fields.get("space origin", np.zeros(n))
+    if vectors.shape != (fields["dimension"], n) or origin.shape != (n,):
+        raise refused(path, "space directions", vectors.tolist(), f"vectors of {n} numbers, one a size, are needed")
+    beside = np.isnan(vectors).all(axis=1) | (timed & ~vectors[:, :3].any(axis=1))
+    if np.count_nonzero(~beside) != 3 or vectors[~beside, 3:].any():
+        raise refused(path, "space directions", vectors.tolist(), "three axes are needed; extract one volume")
+    units = set(fields.get("space units", ["mm"])[:3])
     if len(units) != 1 or not units <= set(MILLIMETRES):
-        raise header.refused("space units", 'it must be "mm" "mm" "mm"; correct it')
-    affine[:3] *= np.array(signs)[:, None] * MILLIMETRES[units.pop()]
-    affine += 0.0  # no minus zero
-    return affine, tuple(k for k in range(len(vectors)) if k not in in_space)
+        raise refused(path, "space units", sorted(units), 'it must be "mm" "mm" "mm"; correct it')
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = vectors[~beside, :3].T, origin[:3]
+    with np.errstate(all="ignore"):  # what is not finite is refused later, with its numbers
+        affine[:3] *= np.array(signs)[:, None] * MILLIMETRES[units.pop()]
+    return affine + 0.0, tuple(int(k) for k in np.flatnonzero(beside))  # no minus zero
 
 
-register(ImageFormat("NRRD", (".nrrd", ".nhdr"), read_nrrd))
+register(ImageFormat("NRRD", (".nrrd", ".nhdr"), read_nrrd, read_on=read_nrrd))

@@ -15,9 +15,8 @@ from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.named_labels import LabelTable, checked_table
 from palpate.images.readers.isolation import ReadLimits, read_stored
 from palpate.images.readers.registry import StoredImage, format_of
-from palpate.images.readers.values import reduced, to_canonical
+from palpate.images.readers.values import check_affine, reduced, to_canonical
 
-MAX_SHEAR = 1e-3  # cosine between two axes; distances are computed on a rectangular grid
 LIMITS = ReadLimits()
 
 
@@ -68,8 +67,9 @@ def _read(
             stored = image_format.stored(path, given)
         else:
             stored = read_stored(path, kind, image_format, limits, given)
-        _check_affine(stored.affine, path)
-        values, affine = to_canonical(reduced(stored.values, path, kind=kind), stored.affine)
+        check_affine(stored.affine, path)
+        stored = reduced(stored, path, kind=kind)
+        values, affine = to_canonical(stored.values, stored.affine)
     except MemoryError as error:
         raise ResourceError(
             f"'{path}' does not fit into the memory of this machine; crop the image to the organs of the case"
@@ -98,23 +98,3 @@ def _check_file(path: Path, kind: str) -> None:
         raise InputDataError(f"'{path}' is a pipe, a socket or a device; save the image as a file")
     if found.st_size == 0:
         raise InputDataError(f"'{path}' is empty (0 bytes); export or copy the image again")
-
-
-def _check_affine(affine: NDArray[np.float64], path: Path) -> None:
-    advice = "repair its header (sform or qform), or export the image again"
-    if not np.isfinite(affine).all():
-        raise InputDataError(f"the header of '{path}' places the voxels at {affine[:3].tolist()}, not finite; {advice}")
-    with np.errstate(all="ignore"):
-        spacing = np.linalg.norm(affine[:3, :3], axis=0)
-        volume, box = abs(np.linalg.det(affine[:3, :3])), np.prod(spacing)
-    if not spacing.min() > 0.0 or not np.isfinite(box) or volume < 1e-6 * box or volume < 1e-12:
-        raise InputDataError(
-            f"the affine in the header of '{path}', {affine[:3].tolist()}, flattens the image (voxel edges"
-            f" {spacing.tolist()} mm, volume {volume:.3g} mm^3); {advice}"
-        )
-    cosines = (affine[:3, :3] / spacing).T @ (affine[:3, :3] / spacing) - np.eye(3)
-    if np.abs(cosines).max() > MAX_SHEAR:
-        raise InputDataError(
-            f"the voxel axes of '{path}' are not at right angles (cosine {np.abs(cosines).max():.3g}, a tilted"
-            " gantry?); resample the image on a rectangular grid"
-        )

@@ -20,6 +20,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import NamedLabel
 
 FOLDER = "/"  # no file's name ends so
+PAIR = (".hdr", ".img", ".hdr.gz", ".img.gz")
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +29,8 @@ class StoredImage:
 
     `names`: what the file itself says of its labels. `digests`: SHA-256 (hexadecimal) of each file as it was read, by
     its part in the image: "" the file itself, "voxels" the one beside it that holds the voxels, or a file's name in a
-    folder; empty when the reader does not say. `findings`: what the user should know of the reading.
+    folder; empty when the reader does not say. `findings`: what the user should know of the reading. `scale`: slope and
+    intercept by which the header makes `values` of the stored numbers.
     """
 
     values: NDArray[Any]
@@ -36,6 +38,7 @@ class StoredImage:
     names: tuple[NamedLabel, ...] = ()
     digests: Mapping[str, str] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
+    scale: tuple[float, float] = (1.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,10 +98,11 @@ def format_of(path: Path) -> ImageFormat:
     marked = marked_format(path)
     if marked is not None:
         return marked
-    known = ", ".join(sorted(set(_FORMATS) - {FOLDER}))
+    known, pair = ", ".join(sorted(set(_FORMATS) - {FOLDER})), path.name.lower().endswith(PAIR)
+    half = ", which is one half of a pair (NIfTI, Analyze; convert both to one .nii.gz)" if pair else ""
     raise InputDataError(
-        f"no reader for '{path}': the endings known are {known}; convert the image to one of these, or name a folder of"
-        " masks"
+        f"no reader for '{path}'{half}: the endings known are {known}; convert the image to one of these, or name a"
+        " folder of masks"
     )
 
 

@@ -6,7 +6,7 @@ Keys: https://slicer.readthedocs.io/en/latest/developer_guide/modules/segmentati
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, printable
-from palpate.images.readers.text_header import unit_colour
+from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, hex_colour, printable
+from palpate.images.readers.text_header import numbers_in
 
-KEY = re.compile(r"Segment([0-9]{1,5})_(\w+)")
+KEY = re.compile(r"Segment([0-9]{1,5})_(ID|Name|Color|LabelValue|Layer)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +58,12 @@ def segments_of(keys: Mapping[str, str], path: Path) -> tuple[Segment, ...]:
             " segmentation again"
         )
     return tuple(segments)
+
+
+def unit_colour(words: Sequence[str]) -> str | None:
+    """Colour #rrggbb of three numbers from 0 to 1; None where they are anything else."""
+    parts = numbers_in(words)
+    return hex_colour(*parts, top=1.0) if len(parts) == 3 else None
 
 
 def _whole(text: str, path: Path, *, low: int) -> int:

@@ -2,100 +2,86 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.images.input_file import InputFile, open_input
-from palpate.images.named_labels import hex_colour, printable
+from palpate.images.named_labels import printable
 
 # Not what float() takes besides: nan, inf, 1_0, digits of other scripts.
 NUMBER = re.compile(r"[+-]?([0-9]{1,400}\.?[0-9]{0,400}|\.[0-9]{1,400})([eE][+-]?[0-9]{1,9})?")
 MAX_LINE = 2**16
-MAX_NUMBER = 1e30  # far beyond any length in mm; products of three stay finite
 MAX_HEADER = 2**22  # bytes; a segmentation of a thousand segments has some 400 kB
 
 
-def header_line(file: BinaryIO, path: Path) -> str | None:
-    """The next line of a header without its end, None at the end of the file.
+def header_lines(file: InputFile, path: Path, last: str) -> list[str]:
+    """The lines of a header, up to the one that the regular expression `last` finds, or the file's end.
 
     Raises `InputDataError` for a line or header longer than any real one.
     """
-    line = file.readline(MAX_LINE + 1)
-    if len(line) > MAX_LINE or file.tell() > MAX_HEADER:
-        raise InputDataError(
-            f"the header of '{path}' does not end or has a line of over {MAX_LINE} bytes; export it again"
-        )
-    return line.decode("utf-8", errors="replace").rstrip("\r\n") if line else None
+    lines: list[str] = []
+    while not (lines and re.match(last, lines[-1], re.IGNORECASE)) and (line := file.readline(MAX_LINE + 1)):
+        if len(line) > MAX_LINE or file.tell() > MAX_HEADER:
+            raise InputDataError(
+                f"the header of '{path}' does not end or has a line of over {MAX_LINE} bytes; export it again"
+            )
+        lines.append(line.decode("utf-8", errors="replace").rstrip())
+    return lines
+
+
+def refused(path: Path, field: str, value: object, advice: str) -> InputDataError:
+    """The sentence for a field of a header that cannot be used."""
+    return InputDataError(f"the header of '{path}' has '{field}: {printable(str(value)[:60])}'; {advice}")
+
+
+def numbers_in(words: Iterable[str]) -> list[float]:
+    """Plain finite numbers, an empty list where one of the words is anything else."""
+    found = [float(word) if NUMBER.fullmatch(word) else np.nan for word in words]
+    return found if np.isfinite(found).all() else []
 
 
 @dataclass(frozen=True, slots=True)
-class TextHeader:
-    """Fields of the header at `path` by their names in lower case; they may be damaged."""
+class StoredArray:
+    """A file's voxels with all of its axes, `beside` those that are not in space (layers, components, time).
 
-    fields: Mapping[str, str]
-    path: Path
+    `affine` (4, 4): index of the axes in space -> RAS mm; `digests`: as of `StoredImage`.
+    """
 
-    def need(self, field: str, advice: str = "export the image again") -> str:
-        """A field that must be there."""
-        if field not in self.fields:
-            raise InputDataError(f"the header of '{self.path}' has no '{field}'; {advice}")
-        return self.fields[field]
+    values: NDArray[Any]
+    affine: NDArray[np.float64]
+    beside: tuple[int, ...]
+    digests: Mapping[str, str]
 
-    def refused(self, field: str, advice: str, *, text: str | None = None) -> InputDataError:
-        """The sentence for a field, or for a text in it, that cannot be used."""
-        shown = printable((self.fields.get(field, "") if text is None else text)[:60])
-        return InputDataError(f"the header of '{self.path}' has '{field}: {shown}'; {advice}")
-
-    def numbers(self, field: str, n: int, text: str | None = None) -> NDArray[np.float64]:
-        """The `n` numbers (n,) of a field, or of a text in it, separated by blanks, in the field's unit.
-
-        Raises `InputDataError` when it holds anything else.
-        """
-        text = self.need(field) if text is None else text
-        words = text.split()
-        plain = len(words) == n and all(NUMBER.fullmatch(word) for word in words)
-        values = np.array([float(word) for word in words]) if plain else np.zeros(0)
-        if len(values) != n or not (np.abs(values) < MAX_NUMBER).all():
-            advice = f"{n} numbers under {MAX_NUMBER:g} are needed: export the image again"
-            raise self.refused(field, advice, text=text)
-        return values
-
-    def counts(self, field: str) -> tuple[int, ...]:
-        """The whole numbers >= 1 of a field; raises `InputDataError` when it holds anything else."""
-        words = self.need(field).split()
-        plain = all(word.isascii() and word.isdigit() and len(word) <= 20 for word in words)
-        sizes = tuple(int(word) for word in words) if plain else ()
-        if not sizes or min(sizes) < 1:
-            raise self.refused(field, "it must be positive counts: export the image again")
-        return sizes
-
-
-def unit_colour(words: Sequence[str]) -> str | None:
-    """Colour #rrggbb of three numbers from 0 to 1; None where they are anything else."""
-    if len(words) != 3 or not all(NUMBER.fullmatch(word) for word in words):
-        return None
-    red, green, blue = (float(word) for word in words)
-    return hex_colour(red, green, blue, top=1.0)
+    def layers(self, path: Path, most: int | None = None) -> NDArray[Any]:
+        """The images (n_layers, n_1, n_2, n_3); raises `InputDataError` for more than `most`, or several such axes."""
+        layers = np.moveaxis(self.values, self.beside, range(len(self.beside)))
+        lists = [n for n in layers.shape[:-3] if n > 1]
+        if len(lists) > 1 or math.prod(lists) > (most or math.inf):
+            sizes = list(self.values.shape)
+            advice = "an image of three axes and one channel is needed; extract one volume (a time point, a channel)"
+            raise refused(path, "sizes", sizes, advice)
+        return layers.reshape(-1, *layers.shape[-3:])
 
 
 def voxels_of(
     file: InputFile, path: Path, name: str | None, read: Callable[[InputFile], NDArray[Any]]
 ) -> tuple[NDArray[Any], dict[str, str]]:
-    """Voxels (nx, ny, nz) that `read` finds in the rest of the file at `path`, or in `name` beside it; the digests."""
+    """The voxels (nx, ny, nz) that `read` finds in the rest of the file, or in `name` beside it, and the digests."""
     if name is None:
         return read(file), {"": file.sha256()}
-    with open_input(beside(path, name)) as other:
+    with open_input(_beside(path, name)) as other:
         return read(other), {"": file.sha256(), "voxels": other.sha256()}
 
 
-def beside(path: Path, name: str) -> Path:
+def _beside(path: Path, name: str) -> Path:
     """The file `name` that holds the voxels of the header `path`; it must lie in the header's folder, links followed.
 
     Raises `InputDataError` when it lies elsewhere, is missing, or is a list or pattern of several files.
@@ -112,13 +98,9 @@ def beside(path: Path, name: str) -> Path:
         found = inside and target.is_file()
     except (OSError, ValueError, RuntimeError):  # a loop of links, a zero byte, a name too long
         inside, found = True, False
+    if found:
+        return target
+    flaw = "but there is no such file beside it; copy it there"
     if not inside:
-        raise InputDataError(
-            f"'{path}' says that its voxels are in '{shown}', outside its own folder, which is not followed; put both"
-            " files into one folder, or save the image as one file"
-        )
-    if not found:
-        raise InputDataError(
-            f"'{path}' says that its voxels are in '{shown}', but there is no such file beside it; copy it there"
-        )
-    return target
+        flaw = "outside its own folder, which is not followed; put both into one folder, or save the image as one file"
+    raise InputDataError(f"'{path}' says that its voxels are in '{shown}', {flaw}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -10,17 +11,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
+from palpate.findings import Finding
 from palpate.images.named_labels import MAX_LABEL
+from palpate.images.readers.registry import StoredImage
 
+MAX_SHEAR = 1e-3  # cosine between two axes; distances are computed on a rectangular grid
 INTEGRAL_TOLERANCE = 1e-3  # resampling and 32-bit scaling leave 0.9999; more is a probability map or a grey image
 
 
-def reduced(values: NDArray[Any], path: Path, *, kind: str) -> NDArray[Any]:
-    """Values (n_1, n_2, n_3) as `label_values`, or as "intensities": float32 in the image's own unit (HU in a CT)."""
-    if kind == "labels":
-        return label_values(values, path)
-    with np.errstate(over="ignore"):
-        return values.astype(np.float32, copy=False)
+def reduced(image: StoredImage, path: Path, *, kind: str) -> StoredImage:
+    """The image with labels as `label_values`, or as "intensities": float32 in the image's own unit (HU in a CT)."""
+    if kind != "labels":
+        with np.errstate(over="ignore"):
+            return replace(image, values=image.values.astype(np.float32, copy=False))
+    slope, intercept = image.scale
+    scaled = f"its header makes them of what is stored by scl_slope {slope:g} and scl_inter {intercept:g}"
+    if image.scale == (1.0, 0.0):
+        return replace(image, values=label_values(image.values, path))
+    try:
+        labels = label_values(image.values, path)
+    except InputDataError as error:
+        raise InputDataError(f"{error}. These are scaled: {scaled}; labels are stored with 1 and 0") from error
+    if 0.0 < slope < 1.0:  # labels that were stored as parts of a range, by programs that scale whatever they save
+        return replace(image, values=labels)
+    text = f"the labels are scaled: {scaled}; set these to 1 and 0 if the stored numbers are the labels"
+    return replace(image, values=labels, findings=(*image.findings, Finding("scaled-labels", text)))
 
 
 def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
@@ -52,6 +67,27 @@ def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
             " is this a grey image? Name the label image (segmentation) instead, or renumber its labels"
         )
     return values.astype(np.uint8 if high <= 255 else np.uint16, copy=False)
+
+
+def check_affine(affine: NDArray[np.float64], path: Path) -> None:
+    """Refuse an affine (4, 4) that is not finite, flat or sheared: raises `InputDataError`."""
+    advice = "repair its header (sform or qform), or export the image again"
+    if not np.isfinite(affine).all():
+        raise InputDataError(f"the header of '{path}' places the voxels at {affine[:3].tolist()}, not finite; {advice}")
+    with np.errstate(all="ignore"):
+        spacing = np.linalg.norm(affine[:3, :3], axis=0)
+        volume, box = abs(np.linalg.det(affine[:3, :3])), np.prod(spacing)
+    if not spacing.min() > 0.0 or not np.isfinite(box) or volume < 1e-6 * box or volume < 1e-12:
+        raise InputDataError(
+            f"the affine in the header of '{path}', {affine[:3].tolist()}, flattens the image (voxel edges"
+            f" {spacing.tolist()} mm, volume {volume:.3g} mm^3); {advice}"
+        )
+    cosines = (affine[:3, :3] / spacing).T @ (affine[:3, :3] / spacing) - np.eye(3)
+    if np.abs(cosines).max() > MAX_SHEAR:
+        raise InputDataError(
+            f"the voxel axes of '{path}' are not at right angles (cosine {np.abs(cosines).max():.3g}, a tilted"
+            " gantry?); resample the image on a rectangular grid"
+        )
 
 
 def to_canonical(values: NDArray[Any], affine: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.float64]]:

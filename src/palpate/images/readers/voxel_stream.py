@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import io
 import math
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +21,26 @@ from palpate.images.input_file import InputFile, open_input
 
 MAX_VOXELS = 2**29  # 512 x 512 x 2048, a whole body at 1 mm; a distance map of it would take 4 GiB
 MAX_OFFSET = 2**26  # bytes that may stand between header and voxels
-MAX_DEFLATE_RATIO = 1032  # no deflate stream expands further (zlib's technical notes)
+DEFLATE = 1032.0  # zlib's technical notes
+BZIP2 = 2.0**21  # 52 runs of 900 kB, packed into some 40 bytes
+MAX_RATIO = {"raw": 1.0, "gzip": DEFLATE, "zlib": DEFLATE, "bzip2": BZIP2}  # bytes that a byte can hold
 SLACK = 2**20  # bytes that may follow the voxels
 CHUNK = 2**22  # bytes that are read, and unpacked, at once
+
+
+class Stream(Protocol):
+    """What bytes are read from."""
+
+    def read(self, n: int, /) -> bytes:
+        """The next bytes, `n` at the most; none at the end."""
 
 
 @dataclass(frozen=True, slots=True)
 class VoxelBlock:
     """What a header says of its voxels: `shape` (fastest axis first), `dtype`, how they are packed.
 
-    packing: "raw", "gzip" or "zlib" (MetaImage's, with either head); skip: bytes before the first voxel, after
-    unpacking; -1: the voxels are the last bytes of the file.
+    packing: "raw", "gzip", "zlib" (with either head), "bzip2" or "ascii"; skip: bytes before the first voxel,
+    after unpacking; -1: the voxels are the last bytes of the file.
     """
 
     shape: tuple[int, ...]
@@ -57,41 +67,38 @@ def opened(path: Path) -> Iterator[InputFile]:
         ) from error
 
 
-def bytes_to_skip(text: str, packing: str) -> int | None:
-    """A header's number for `VoxelBlock.skip`, -1 for raw voxels only; None where `text` is no number that can be."""
-    if text == "-1" and packing == "raw":
-        return -1
-    plain = text.isascii() and text.isdigit() and len(text) <= 12 and int(text) <= MAX_OFFSET
-    return int(text) if plain else None
-
-
 def read_block(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
     """The voxels (n_1, n_2, n_3), or with more axes, in the machine's byte order, from where `file` stands.
 
     `path` is for messages, for voxels may lie in a file beside the header.
     Raises `InputDataError` when the file cannot hold them or goes on for long after them.
     """
-    available, skip, packed = file.n_bytes - file.tell(), max(block.skip, 0), block.packing != "raw"
-    check_size(block.shape, skip + block.n_bytes, path, available=available, packed=packed)
-    stream: BinaryIO = file
-    if block.skip < 0:
-        skip = available - block.n_bytes
-    if block.packing == "gzip":
-        stream = gzip_stream(file)
-    elif block.packing == "zlib":
-        stream = io.BufferedReader(_Inflated(file), buffer_size=CHUNK)
+    available, skip = file.n_bytes - file.tell(), block.skip
+    if not (0 <= skip <= MAX_OFFSET or (skip == -1 and block.packing == "raw")):
+        raise InputDataError(
+            f"the header of '{path}' has {count(skip)} bytes before the first voxel, not 0 to {MAX_OFFSET}, or -1 where"
+            " they are raw; export the image again"
+        )
+    if block.packing == "ascii":
+        return _written(file, block, path)
+    needed, packed = max(skip, 0) + block.n_bytes, MAX_RATIO[block.packing]
+    check_size(block.shape, needed, path, available=available, packed=packed)
+    skip = available - block.n_bytes if skip < 0 else skip
+    stream = OPENED[block.packing](file)
     while skip:
         skip -= len(read_exactly(stream, min(skip, SLACK), path))
     return read_voxels(stream, block, path)
 
 
-def read_voxels(stream: BinaryIO, block: VoxelBlock, path: Path) -> NDArray[Any]:
+def read_voxels(stream: Stream, block: VoxelBlock, path: Path) -> NDArray[Any]:
     """The voxels (nx, ny, nz) of `block`, whose size was checked, from where `stream` stands.
 
     Raises `InputDataError` when it ends before they do, or goes on for long after them.
     """
-    values = read_exactly(stream, block.n_bytes, path).view(block.dtype)
-    if len(stream.read(SLACK + 1)) > SLACK:  # to its end, where gzip checks its sum
+    values, left = read_exactly(stream, block.n_bytes, path).view(block.dtype), SLACK
+    while left >= 0 and (rest := stream.read(left + 1)):  # to its end, where the sum is checked
+        left -= len(rest)
+    if left < 0:
         raise InputDataError(
             f"'{path}' goes on for more than {SLACK} bytes after the {block.n_bytes} bytes of voxels that its header"
             " declares; it is damaged or not what it claims to be: export it again"
@@ -99,32 +106,45 @@ def read_voxels(stream: BinaryIO, block: VoxelBlock, path: Path) -> NDArray[Any]
     return values.astype(block.dtype.newbyteorder("="), copy=False).reshape(block.shape, order="F")
 
 
-def check_size(shape: tuple[int, ...], needed: int, path: Path, *, available: int, packed: bool) -> None:
-    """Refuse what the file cannot hold: `needed` bytes after unpacking, `available` bytes before it."""
+def _written(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
+    """Voxels that are written out as decimal numbers; each is exact in its type."""
+    n = math.prod(block.shape)
+    check_size(block.shape, 2 * n - 1, path, available=file.n_bytes - file.tell() - block.skip)
+    try:
+        values = np.array(file.read()[block.skip :].split()).astype(np.float64)
+    except ValueError:
+        values = np.zeros(0)
+    with np.errstate(all="ignore"):
+        exact = values.astype(block.dtype.newbyteorder("="))
+    if len(values) != n or not (block.dtype.kind == "f" or (exact == values).all()):
+        raise InputDataError(
+            f"the voxels of '{path}' are written as text, but {n} numbers of the type {block.dtype.name} are not there;"
+            " export the image again"
+        )
+    return exact.reshape(block.shape, order="F")
 
-    def count(number: int) -> str:
-        """A count that a damaged header may have made absurd."""
-        return str(number) if number < 10**12 else f"over {10**12}"
 
+def count(number: int) -> str:
+    """A count that a damaged header may have made absurd."""
+    return str(number) if abs(number) < 10**12 else f"over {10**12}"
+
+
+def check_size(shape: tuple[int, ...], needed: int, path: Path, *, available: int, packed: float = 1.0) -> None:
+    """Refuse what the file cannot hold: `needed` bytes in `available` ones, of which each holds `packed` at most."""
     sizes = " x ".join(map(count, shape))
     if math.prod(shape) > MAX_VOXELS:
         raise InputDataError(
             f"the header of '{path}' promises {count(math.prod(shape))} voxels ({sizes}), more than the {MAX_VOXELS}"
             " that are read; crop the image to the organs, or the header is damaged"
         )
-    if needed > (available * MAX_DEFLATE_RATIO if packed else available):
+    if needed > available * packed:
         raise InputDataError(
             f"the header of '{path}' promises {needed} bytes ({sizes} voxels), but the {available} bytes there"
             " cannot hold them; the file is cut short or its header damaged: export or copy it again"
         )
 
 
-def gzip_stream(file: InputFile) -> BinaryIO:
-    """What is packed in the file from where it stands; no more is unpacked than is asked for."""
-    return io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb"))
-
-
-def read_exactly(stream: BinaryIO, n_bytes: int, path: Path) -> NDArray[np.uint8]:
+def read_exactly(stream: Stream, n_bytes: int, path: Path) -> NDArray[np.uint8]:
     """The next bytes (n_bytes,) of the stream; pages of the buffer are only taken as the data come.
 
     Raises `InputDataError` when it ends before.
@@ -142,29 +162,35 @@ def read_exactly(stream: BinaryIO, n_bytes: int, path: Path) -> NDArray[np.uint8
     return buffer
 
 
-class _Inflated(io.RawIOBase):
+class _Inflated:
     """A zlib or gzip stream, unpacked no further than is asked for."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         self._inflate = zlib.decompressobj(47)  # 32 + 15: either head
 
-    def readable(self) -> bool:
-        """Always: `io.BufferedReader` asks before it reads."""
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        """Fill `buffer` from its start with unpacked bytes and return their number, 0 after the stream's end mark.
+    def read(self, n: int) -> bytes:
+        """The next bytes, `n` at the most; none after the stream's end mark.
 
         Raises `EOFError` when the file ends before that mark.
         """
-        target = memoryview(buffer).cast("B")
-        while not self._inflate.eof:
+        content = b""
+        while not content and not self._inflate.eof:
             packed = self._inflate.unconsumed_tail or self._file.read(CHUNK)
-            content = self._inflate.decompress(packed, len(target))
-            if content:
-                target[: len(content)] = content
-                return len(content)
-            if not packed:
+            content = self._inflate.decompress(packed, n)
+            if not content and not packed:
                 raise EOFError("the compressed voxels end before their end mark")
-        return 0
+        return content
+
+
+def gzip_stream(file: InputFile) -> BinaryIO:
+    """What is packed in the file from where it stands; no more is unpacked than is asked for."""
+    return io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb"))
+
+
+OPENED: dict[str, Callable[[InputFile], Stream]] = {
+    "raw": lambda file: file,
+    "gzip": gzip_stream,
+    "zlib": _Inflated,
+    "bzip2": bz2.BZ2File,
+}
