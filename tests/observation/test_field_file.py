@@ -42,7 +42,7 @@ def nifti(folder, vectors, *, affine=AFFINE, unit="mm", four=False, ending=".nii
     image.set_sform(affine, code=more.pop("sform_code", 1))
     image.header.set_xyzt_units(unit)
     content = bytearray(image.to_bytes())
-    header = image.header.copy()
+    header = kind.header_class(bytes(content[: len(image.header.binaryblock)]), check=False)
     for key, value in more.items():
         header[key] = value
     content[: len(header.binaryblock)] = header.binaryblock
@@ -123,9 +123,10 @@ def test_nifti_that_says_nothing_or_something_else_is_refused(tmp_path, what, ax
         read(nifti(tmp_path, **what), axes)
 
 
-def nrrd_file(path, vectors, space, *, named="", last=False, unit=1.0, **more):
+def nrrd_file(path, vectors, space, *, named="", last=False, unit=1.0, few=3, **more):
     """An NRRD file of vectors as they are; its grid is the one of `AFFINE`, in `space`."""
     signs = {"right-anterior-superior": np.ones(3), "left-posterior-superior": LPS, "LAS": LPS * [1, -1, 1]}[space]
+    vectors = vectors[..., :few]
     edges = list((signs[:, None] * AFFINE[:3, :3] * unit).T)
     none = np.full(3, np.nan)
     header = {
@@ -154,6 +155,7 @@ FRAME = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # its ro
         (MOVED * LPS, "left-posterior-superior", {"unit": 1e-3, "space units": ["m", "m", "m"]}, ""),
         (MOVED * LPS, "left-posterior-superior", {"kinds": ["covariant-vector", *["space"] * 3]}, ""),
         (MOVED * LPS, "left-posterior-superior", {"kinds": ["list", *["domain"] * 3]}, ""),
+        (MOVED * LPS, "left-posterior-superior", {"kinds": ["domain"] * 4}, ""),
     ],
 )
 def test_nrrd_is_read_as_its_header_says(tmp_path, vectors, space, more, axes):
@@ -165,9 +167,9 @@ def test_nrrd_is_read_as_its_header_says(tmp_path, vectors, space, more, axes):
     [
         ("right-anterior-superior", {}, "", "does not say"),
         ("right-anterior-superior", {"measurement frame": np.eye(3)}, "LPS", "take the key out"),
-        ("left-posterior-superior", {"space units": ["inch"] * 3}, "", "export it in mm"),
+        ("left-posterior-superior", {"space units": ["inch"] * 3}, "", "must be"),
         ("left-posterior-superior", {"named": "scanner-xyz"}, "", "right, front and head"),
-        ("left-posterior-superior", {"kinds": ["domain"] * 4}, "", "cannot be read"),
+        ("left-posterior-superior", {"kinds": ["vector"] + ["domain"] * 3, "few": 2}, "", "has 2 components"),
     ],
 )
 def test_nrrd_that_says_too_little_is_refused(tmp_path, space, more, axes, words):
@@ -175,23 +177,36 @@ def test_nrrd_that_says_too_little_is_refused(tmp_path, space, more, axes, words
         read(nrrd_file(tmp_path / "field.nrrd", MOVED, space, **more), axes)
 
 
-def itk_image(vectors=None, scale=1.0):
-    """A vector image of SimpleITK on the grid of `AFFINE`, LPS mm."""
-    vectors = MOVED * LPS if vectors is None else vectors
-    image = SimpleITK.GetImageFromArray(np.swapaxes(vectors, 0, 2) * scale, isVector=True)
-    image.SetOrigin(LPS * AFFINE[:3, 3] * scale)
-    image.SetSpacing(np.array([2.0, 2.5, 3.0]) * scale)
+def itk_image():
+    """The field as a vector image of SimpleITK, LPS mm."""
+    image = SimpleITK.GetImageFromArray(np.swapaxes(MOVED * LPS, 0, 2), isVector=True)
+    image.SetOrigin(LPS * AFFINE[:3, 3])
+    image.SetSpacing(np.array([2.0, 2.5, 3.0]))
     image.SetDirection((LPS[:, None] * TURN).ravel())
     return image
 
 
 @pytest.mark.parametrize("ending", [".mha", ".mhd"])
-def test_metaimage_is_read_in_its_unit_and_both_its_files_are_digested(tmp_path, ending):
+def test_metaimage_is_read_in_lps_and_both_its_files_are_digested(tmp_path, ending):
     path = tmp_path / f"field{ending}"
-    SimpleITK.WriteImage(itk_image(scale=1e3), str(path))
-    path.write_bytes(path.read_bytes().replace(b"ElementDataFile", b"DistanceUnits = um\nElementDataFile", 1))
+    SimpleITK.WriteImage(itk_image(), str(path))
     check(path)
     assert len(read(path).digests) == 1 + (ending == ".mhd")
+    np.testing.assert_allclose(read(path, "RAS").moved, read(path, "LPS").moved * LPS, atol=1e-9)
+    path.write_bytes(path.read_bytes().replace(b"ElementDataFile", b"DistanceUnits = um\nElementDataFile", 1))
+    with pytest.raises(InputDataError, match="DistanceUnits"):
+        read(path)
+
+
+@pytest.mark.parametrize(("intent", "signs"), [(1006, np.ones(3)), (1007, LPS)])
+def test_nifti_is_the_field_that_itk_reads(tmp_path, intent, signs):
+    path = nifti(tmp_path, MOVED * signs, intent_code=intent)
+    image = SimpleITK.ReadImage(str(path))
+    index = (1, 2, 3)
+    place, vector = image.TransformIndexToPhysicalPoint(index), image.GetPixel(index)
+    table = read(path)
+    (row,) = np.flatnonzero(np.linalg.norm(table.before - LPS * place, axis=1) < 1e-3)
+    np.testing.assert_allclose(table.moved[row], LPS * vector, atol=1e-5)
 
 
 @pytest.mark.parametrize("field", ["ElementDataFile = ../away.raw", "ElementDataFile: ../away.raw"])

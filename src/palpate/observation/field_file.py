@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.named_labels import printable
+from palpate.images.readers.metaimage import metaimage_content
 from palpate.images.readers.nifti import nifti_affine, nifti_content, nifti_millimetres
-from palpate.images.readers.text_header import beside
+from palpate.images.readers.nrrd import MILLIMETRES, RAS_SIGNS, nrrd_content
+from palpate.images.readers.text_header import StoredArray
 from palpate.images.readers.voxel_stream import opened
 from palpate.observation.measured_points import read_text
 
@@ -25,9 +27,7 @@ Field = tuple[NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]
 MEMORY = 8 * 2**30  # bytes that a field may take
 OF_VECTOR, OF_PART = 144, 32  # bytes, until it is a pair of points; and for each transform of a file
 IN_FILE = 24  # bytes of a vector, in most files of transforms
-MAX_HEADER = 2**20
-SIGNS = {"RAS": np.ones(3), "LPS": LPS_TO_RAS, "LAS": np.array([-1.0, 1.0, 1.0])}
-UNITS = {"mm": 1.0, "millimeter": 1.0, "millimeters": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "microns": 1e-3}
+SIGNS = {"RAS": np.ones(3), "LPS": LPS_TO_RAS}
 DISPVECT, VECTOR = 1006, 1007  # intents of NIfTI, which ITK has in RAS and LPS; Workbench writes the second in RAS, too
 NAMES = {"Mapping": True, "NREG_TRANS 0": True, "NREG_TRANS 1": False}  # of SPM and NiftyReg: whether of positions
 OF_FSL = (2006, 2007, 2008, 2009, 2016, 2017, 2018)
@@ -48,7 +48,8 @@ def read_field(path: Path, axes: str) -> Field:
     try:
         return reader(path, axes)
     except ImportError as error:
-        raise ConfigurationError(f"'{path}' is read by SimpleITK: pip install simpleitk, or write .nii.gz") from error
+        advice = "pip install 'palpate[itk]', or write the field as .nii.gz"
+        raise ConfigurationError(f"'{path}' is read by SimpleITK: {advice}") from error
     except (RuntimeError, ValueError) as error:
         flaw = " ".join(str(error).splitlines()[-1:])
         raise InputDataError(f"'{path}' cannot be read: {flaw}; export it again") from error
@@ -109,52 +110,36 @@ def _nifti_kind(header: Any, axes: str, path: Path) -> tuple[NDArray[np.float64]
             " velocities of NiftyReg by reg_transform -disp, a warp of FSL by wb_command -convert-warpfield -from-fnirt"
             ' ... -to-world, and state axes = "RAS"'
         )
-    told = {DISPVECT: "RAS", VECTOR: axes or "LPS"}.get(intent, "")
-    return _signs(told, axes, path), False
+    return _signs({DISPVECT: "RAS", VECTOR: axes or "LPS"}.get(intent, ""), axes, path), False
 
 
-def _image(path: Path, axes: str) -> Field:
-    """An image of vectors, NRRD or MetaImage; of the latter ITK takes the vectors for LPS."""
-    with opened(path) as file:
-        head, digests = file.read(MAX_HEADER).decode("latin-1"), [file.sha256()]
-    pairs = re.findall(r"(?m)^([\w ]{1,40}?)[ \t]*[:=](?!=)[ \t]*(.*?)\s*$", head)
-    fields = {name.lower(): value for name, value in reversed(pairs)}  # the first of a name: behind them are voxels
-    voxels = fields.get("data file") or fields.get("datafile") or fields.get("elementdatafile", "LOCAL")
-    if voxels.upper() != "LOCAL":
-        digests.append(_sha256(beside(path, voxels)))
-    units = set(re.findall(r"\w+", fields.get("space units", fields.get("distanceunits", "")).lower())) or {"mm"}
-    if len(units) != 1 or not units <= set(UNITS):
-        raise InputDataError(f"'{path}' has lengths in {printable(str(sorted(units))[:60])}; export it in mm")
-    turn = _of_nrrd(fields, axes, path) if head.startswith("NRRD") else np.diag(SIGNS[axes or "LPS"])
-    reader, unit = import_module("SimpleITK").ImageFileReader(), UNITS[units.pop()]
-    reader.SetFileName(str(path))
-    reader.ReadImageInformation()
-    n_axes, n_components = reader.GetDimension(), reader.GetNumberOfComponents()
-    if (n_axes, n_components) != (3, 3):
-        raise InputDataError(f"'{path}' has {n_axes} axes and {n_components} components; export three of both")
-    _refuse_many(reader.GetSize(), path)
-    vectors, affine = _of_itk(reader.Execute())
-    affine[:3] *= unit
-    return vectors @ (unit * turn.T), affine, tuple(digests)
-
-
-def _of_nrrd(fields: dict[str, str], axes: str, path: Path) -> NDArray[np.float64]:
-    """What turns the vectors of an NRRD file to RAS, (3, 3): its measurement frame, else its space where that is LPS.
-
-    ITK takes vectors for LPS in every space; the format itself leaves them open where there is no frame.
-    """
-    words = fields.get("space", "").upper().split("-")
-    space = "".join(word[:1] for word in words) if len(words) > 1 else words[0]
-    if space not in SIGNS:
-        raise InputDataError(
-            f"'{path}' does not say where right, front and head are; export it in the space LPS or RAS"
-        )
-    if "measurement frame" not in fields:
-        return np.diag(_signs(axes or ("LPS" if space == "LPS" else ""), axes, path))
+def _nrrd(path: Path, axes: str) -> Field:
+    """Vectors in the measurement frame; where there is none, as ITK has them in LPS: the format leaves them open."""
+    array, header = nrrd_content(path)
+    space, unit = str(header["space"]).lower(), MILLIMETRES[header.get("space units", ["mm"])[0]]
+    if space not in RAS_SIGNS:
+        raise InputDataError(f"'{path}' has a time axis ({printable(space)}); extract one volume")
+    if "measurement frame" not in header:
+        told = "LPS" if RAS_SIGNS[space] == RAS_SIGNS["lps"] else ""
+        return _field(array, unit * np.diag(_signs(axes or told, axes, path)), path)
     if axes:
         _signs("its measurement frame", axes, path)  # which refuses both
-    columns = np.array([float(x) for x in re.findall(r"[^(),\s]+", fields["measurement frame"])]).reshape(3, 3)
-    return np.asarray(SIGNS[space][:, None] * columns.T)
+    columns = np.asarray(header["measurement frame"], dtype=np.float64)
+    return _field(array, unit * np.array(RAS_SIGNS[space])[:, None] * columns.T, path)
+
+
+def _metaimage(path: Path, axes: str) -> Field:
+    """Vectors that ITK takes for LPS, where the case does not say otherwise."""
+    return _field(metaimage_content(path), np.diag(SIGNS[axes or "LPS"]), path)
+
+
+def _field(array: StoredArray, turn: NDArray[np.float64], path: Path) -> Field:
+    """The field of an image whose vectors `turn` (3, 3) brings to RAS mm."""
+    components = array.layers(path)
+    if len(components) != 3:
+        raise InputDataError(f"'{path}' has {len(components)} components; export three")
+    _refuse_many(components.shape[1:], path)
+    return np.moveaxis(components, 0, -1) @ turn.T, array.affine, tuple(array.digests.values())
 
 
 def _transform(path: Path, axes: str) -> Field:
@@ -217,11 +202,13 @@ def _of_xfm(path: Path, digests: list[str]) -> list[Any]:
 
     SimpleITK gives one of several: it gets each in a file of its own.
     """
-    parts = []
+    parts = list[Any]()
     with TemporaryDirectory() as folder:
         for n, text in enumerate(re.split(r"(?m)^(?=Transform_Type)", read_text(path)[0])[1:]):
             part, grid = Path(folder, f"{n}.xfm"), re.search(r"Displacement_Volume\s*=\s*([^;]*?)\s*;", text)
-            volume = beside(path, grid[1]) if grid else path
+            volume = (path.parent / (grid[1] if grid else path.name)).resolve()
+            if not volume.is_relative_to(path.parent.resolve()):
+                raise InputDataError(f"'{path}' names a grid outside its own folder, which is not read; put it there")
             digests += [_sha256(volume)] if grid else []
             own = text.replace(grid[1], str(volume)) if grid else text
             part.write_text(f"MNI Transform File\n{own}", encoding="utf-8")
@@ -253,6 +240,7 @@ def _centres(vectors: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArr
 
 READERS: dict[tuple[str, ...], Callable[[Path, str], Field]] = {
     (".nii", ".nii.gz"): _nifti,
-    (".nrrd", ".nhdr", ".mha", ".mhd"): _image,
+    (".nrrd", ".nhdr"): _nrrd,
+    (".mha", ".mhd"): _metaimage,
     (".h5", ".hdf5", ".tfm", ".txt", ".xfm", ".mat"): _transform,
 }

@@ -85,7 +85,7 @@ def read_landmarks(file: DataFile) -> Landmarks:
             " file and file_after"
         )
     labels = [[label for label, _ in own] for own in lists]
-    pairs = np.array(_pairs(*labels, where), dtype=np.int64).reshape(-1, 2)
+    pairs = np.array(_pairs(labels[0], labels[1], where), dtype=np.int64).reshape(-1, 2)
     points = np.array([[own[n][1] for own, n in zip(lists, pair, strict=True)] for pair in pairs]).reshape(-1, 2, 3)
     placed = np.isfinite(points).all(axis=(1, 2))
     left = dict.fromkeys(
