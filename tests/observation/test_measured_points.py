@@ -261,7 +261,14 @@ def test_a_field_of_a_row_or_two_is_no_field_but_a_marker_is_one(tmp_path, point
 
 
 @pytest.mark.parametrize(
-    "content", ["{}", "[", '{"markups": 3}', '{"markups": [{"controlPoints": [{"position": [1]}]}]}']
+    "content",
+    [
+        "{}",
+        "[",
+        '{"markups": 3}',
+        '{"markups": [{"controlPoints": [{"position": [1]}]}]}',
+        '{"markups": [{"coordinateUnits": [], "controlPoints": []}]}',
+    ],
 )
 def test_a_markups_file_that_is_none_is_refused(tmp_path, content):
     (tmp_path / "m.mrk.json").write_text(content)

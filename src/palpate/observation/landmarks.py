@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.findings import Finding
 from palpate.images.label_image import LPS_TO_RAS
+from palpate.images.named_labels import printable
 from palpate.mesh.locate import located
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.contract import DataFile, ReactionOf
@@ -140,9 +141,9 @@ def _markups(content: str, path: Path) -> list[Marks]:
             for point in markup["controlPoints"]:
                 placed = point.get("positionStatus", "defined") == "defined" and point.get("position") is not None
                 x, y, z = map(float, point["position"]) if placed else NOWHERE
-                points.append((str(point.get("label", "")).strip()[:200], TO_RAS[system] * (x, y, z)))
+                points.append((printable(str(point.get("label", "")).strip()[:200]), TO_RAS[system] * (x, y, z)))
             lists.append(points)
-    except (ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, RecursionError, LookupError, TypeError, AttributeError) as error:
         raise InputDataError(
             f"'{path}' is no markups file of 3D Slicer ({type(error).__name__}: {error}); landmarks are read from"
             " .mrk.json, .fcsv and .csv"
@@ -159,14 +160,14 @@ def _fcsv(content: str, path: Path) -> list[Marks]:
     if system not in TO_RAS or not {"x", "y", "z"} <= set(columns):
         raise InputDataError(f"'{path}' states the coordinate system {system[:20]!r}; export it in LPS or RAS")
     points = []
-    for line in csv.reader(line for line in content.splitlines() if line.strip() and not line.startswith("#")):
-        row = dict(zip([*columns, "status"], line, strict=False))
-        try:
+    try:
+        for line in csv.reader(line for line in content.splitlines() if line.strip() and not line.startswith("#")):
+            row = dict(zip([*columns, "status"], line, strict=False))
             placed = row.get("status", "") in PLACED
             position = [float(row[axis]) for axis in "xyz"] if placed else NOWHERE
-        except (KeyError, ValueError) as error:
-            raise InputDataError(f"a line of '{path}' holds no point ({error}); export it again") from error
-        points.append((row.get("label", "").strip()[:200], TO_RAS[system] * position))
+            points.append((printable(row.get("label", "").strip()[:200]), TO_RAS[system] * position))
+    except (KeyError, ValueError, csv.Error) as error:
+        raise InputDataError(f"a line of '{path}' holds no point ({error}); export it again") from error
     return [points]
 
 

@@ -16,6 +16,7 @@ from palpate.findings import Finding
 from palpate.images.alignment import RigidMotion
 from palpate.images.input_file import read_input
 from palpate.images.label_image import LPS_TO_RAS
+from palpate.images.named_labels import printable
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.locate import located
 from palpate.mesh.space import LagrangeSpace
@@ -127,7 +128,7 @@ def read_point_table(path: Path) -> PointTable:
                 raise InputDataError(
                     f"line {number} of '{path}' holds no six numbers ({error}); correct it, or take it out"
                 ) from error
-            labels.append((line.get("label") or "").strip()[:200])
+            labels.append(printable((line.get("label") or "").strip()[:200]))
     except csv.Error as error:
         raise InputDataError(f"the table '{path}' is damaged: {error}; export it again") from error
     values = np.array(rows, dtype=np.float64).reshape(-1, 2, 3)
