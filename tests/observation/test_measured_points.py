@@ -241,6 +241,7 @@ def test_lps_read_as_ras_is_recognised(tmp_path, space, points):
         ("x,y,z\n1,2,3\n", "lacks the column"),
         ("before_x,before_y,before_z,after_x,after_y,after_z\n", "no pair of points"),
         ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2,nan,1,2,3\n", "no number"),
+        ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2,1e308,1,2,-1e308\n", "absurd"),
         ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2,three,1,2,3\n", "line 2"),
         ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2,3,1,2,3\n", "where they lay before"),
         ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2\n", "no number"),

@@ -91,7 +91,8 @@ def _nifti(path: Path, axes: str) -> Field:
 
     content = nifti_content(path, check)
     affine, (signs, positions) = nifti_affine(content.header, path), _nifti_kind(content.header, axes, path)
-    vectors = content.values.reshape(*content.values.shape[:3], 3) * (signs * nifti_millimetres(content.header, path))
+    with np.errstate(all="ignore"):  # what is not finite is none
+        vectors = content.values.reshape(*content.values.shape[:3], 3) * signs * nifti_millimetres(content.header, path)
     if positions:
         vectors[~vectors.any(axis=-1)] = np.nan
         vectors -= _centres(vectors, affine)

@@ -25,6 +25,7 @@ from palpate.observation.contract import DataFile
 MOST_BYTES = 64 * 2**20
 COLUMNS = tuple(f"{when}_{axis}" for when in ("before", "after") for axis in "xyz")
 METRES = 1000.0
+FARTHEST = 1e9  # mm
 SLIP = 0.5  # share of the points inside the mesh, from which on a slip explains them
 MOST_POINTS = 20_000  # whose direction, or place, is looked at
 TELLING = 20  # points whose tissue tells where they went
@@ -155,10 +156,10 @@ def checked_table(table: PointTable, path: Path) -> PointTable:
     """The table itself, if it has points, all of them numbers, that move as a body does; raises `InputDataError`."""
     if len(table.before) == 0:
         raise InputDataError(f"'{path}' holds no pair of points; export it with at least one")
-    bad = np.flatnonzero(~np.isfinite(np.concatenate([table.before, table.after], axis=1)).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(np.concatenate([table.before, table.after], axis=1)) < FARTHEST).all(axis=1))
     if len(bad):
         raise InputDataError(
-            f"pair {bad[0] + 1} of '{path}' has a coordinate that is missing or no number ({len(bad)} of"
+            f"pair {bad[0] + 1} of '{path}' has a coordinate that is missing, no number or absurd ({len(bad)} of"
             f" {len(table.before)} pairs); take such pairs out"
         )
     if np.array_equal(table.before, table.after):
