@@ -25,10 +25,9 @@ FARTHEST = 1e9  # mm, voxels
 OFFSET, GEOMETRY, EXTENT = (
     f"Segmentation_{key}" for key in ("ReferenceImageExtentOffset", "ConversionParameters", "Extent")
 )
-CROPPED = (
-    "the image ends with the segments, for 3D Slicer cropped it to them; save it there without 'crop to minimum"
-    " extent', or name a grey image on its grid as intensities"
-)
+CROPPED = "the image ends with the segments, for 3D Slicer cropped it to them"
+PERHAPS = "segments reach all six sides of the image, as where 3D Slicer cropped it to them"
+ADVICE = "save it there without 'crop to minimum extent', or name a grey image on its grid as intensities"
 
 
 def on_grid(image: StoredImage, grid: VoxelGrid) -> StoredImage | None:
@@ -76,7 +75,8 @@ def uncropped(image: StoredImage, keys: Mapping[str, str], grid: VoxelGrid | Non
     begin = image.affine.copy()
     begin[:3, 3] -= begin[:3, :3] @ first
     begun = on_grid(image, VoxelGrid((shape[0], shape[1], shape[2]), begin))
-    return replace(begun or image, findings=(*image.findings, Finding("cropped", CROPPED)))
+    finding = Finding("cropped", f"{CROPPED if first.any() else PERHAPS}; {ADVICE}")
+    return replace(begun or image, findings=(*image.findings, finding))
 
 
 def _reference(parameters: str, path: Path) -> VoxelGrid | None:
