@@ -49,6 +49,7 @@ Misleading = Literal[
 Widening = Literal[
     "ratio-only",
     "map-of-prior",
+    "points-unpaired",
     "motion-below-noise",
     "correlated",
     "several-minima",

@@ -56,6 +56,21 @@ def markups(points, labels, *, system="LPS"):
     return {"markups": [{"type": "Fiducial", "coordinateSystem": system, "controlPoints": controls}]}
 
 
+def write_lists(folder, *lists):
+    """Files a.mrk.json and b.mrk.json of (labels, points, indices of those that were not placed)."""
+    paths = []
+    for name, (labels, points, unplaced) in zip("ab", lists, strict=True):
+        content = markups(points, labels)
+        for n, status in zip(unplaced, ("undefined", "missing", "preview") * len(unplaced), strict=False):
+            control = content["markups"][0]["controlPoints"][n]
+            control |= {"positionStatus": status, "position": [0.0, 0.0, 0.0]}
+            if status == "missing":
+                del control["position"]
+        paths.append(folder / f"{name}.mrk.json")
+        paths[-1].write_text(json.dumps(content))
+    return paths
+
+
 def csv_of(path, before, after, *, columns="before_x,before_y,before_z,after_x,after_y,after_z"):
     rows = [",".join(f"{x:.9g}" for x in row) for row in np.concatenate([before, after], axis=1)]
     path.write_text("\n".join([columns, *rows]) + "\n")
@@ -91,6 +106,95 @@ def test_fcsv_says_its_coordinate_system(tmp_path, points, system):
     table = read(tmp_path / "a.fcsv", tmp_path / "b.fcsv").table
     np.testing.assert_allclose(table.before, points, atol=1e-9)
     np.testing.assert_allclose(table.after, moved(points), atol=1e-9)
+
+
+def numbered(name, numbers):
+    return [f"{name}-{n}" for n in numbers]
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (numbered("F", range(25)), numbered("F", range(25))),
+        (numbered("before", range(25)), numbered("after", range(25))),  # of 3D Slicer: the list's name and a number
+        ([""] * 25, [""] * 25),
+        (["bead"] * 25, ["bead"] * 25),
+        (numbered("F", range(25)), numbered("F", range(25, 50))),  # numbered on: only the order tells
+    ],
+)
+def test_points_that_were_not_placed_are_left_out_and_named_however_pairs_are_found(tmp_path, points, first, second):
+    paths = write_lists(tmp_path, (first, points, [2, 7]), (second, moved(points), [20]))
+    source = read(*paths)
+    kept = np.delete(np.arange(25), [2, 7, 20])
+    np.testing.assert_allclose(source.table.before, points[kept], atol=1e-9)
+    np.testing.assert_allclose(source.table.after, moved(points)[kept], atol=1e-9)
+    (finding,) = source.table.pairing
+    assert finding.code == "points-unpaired"
+    assert all(f"{name or 'number 3'}" in finding.message for name in (first[2], first[7], second[20]) if name)
+
+
+def test_points_that_one_list_lacks_are_left_out_and_the_others_are_paired_by_label(tmp_path, space, points):
+    """Also where both lists are equally long, and where a label stands twice."""
+    labels = [*numbered("F", range(23)), "twice", "twice"]
+    first, second = np.delete(np.arange(25), [3, 11]), np.delete(np.arange(25), [5, 17])[::-1]
+    own = [[labels[n] for n in each] for each in (first, second)]
+    source = read(*write_lists(tmp_path, (own[0], points[first], []), (own[1], moved(points)[second], [])))
+    kept = [n for n in range(23) if n not in {3, 5, 11, 17}]
+    np.testing.assert_allclose(source.table.before, points[kept], atol=1e-9)
+    np.testing.assert_allclose(source.table.after, moved(points)[kept], atol=1e-9)
+    _, (finding,) = source.on(space, no_force)
+    assert all(name in finding.message for name in ("F-3", "F-5", "F-11", "F-17", "twice"))
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (numbered("F", range(25)), numbered("F", range(20, 44))),
+        (numbered("F", range(25)), numbered("F", range(20, 45))),
+        ([""] * 25, [""] * 24),
+    ],
+)
+def test_lists_whose_labels_hardly_agree_or_tell_nothing_of_another_length_are_refused(tmp_path, points, first, second):
+    later = moved(points)[: len(second)]
+    with pytest.raises(InputDataError, match="the same label"):
+        read(*write_lists(tmp_path, (first, points, []), (second, later, [])))
+
+
+def test_positions_for_displacements_and_pairs_of_many_other_points_are_recognised(tmp_path):
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-20.0, 30.0, (400, 3))
+    for after in (rng.permutation(moved(points)), moved(points) - points, 1e-3 * moved(points), 2.0 * points):
+        with pytest.raises(InputDataError, match="positions in place of displacements"):
+            read(csv_of(tmp_path / "m.csv", points, after))
+    half_turned = np.diag([-1.0, -1.0, 1.0])
+    assert len(read(csv_of(tmp_path / "m.csv", points, points @ half_turned)).table.before) == len(points)
+
+
+def test_fcsv_of_slicer_3_and_5(tmp_path, points):
+    """The old one begins with the label; the new one has the status of each point behind the columns that it names."""
+    rows = [f"F-{i},{p[0]!r},{p[1]!r},{p[2]!r},1,1" for i, p in enumerate(points.tolist())]
+    (tmp_path / "a.fcsv").write_text("\n".join(["# columns = label,x,y,z,sel,vis", *rows]) + "\n")
+    status = ["0" if i == 4 else "2" for i in range(len(points))]
+    rows = [
+        f"{i},{-p[0]!r},{-p[1]!r},{p[2]!r},0,0,0,1,1,1,0,F-{i},,,{status[i]},0"
+        for i, p in enumerate(moved(points).tolist())
+    ]
+    head = ["# Markups fiducial file version = 5.6", "# CoordinateSystem = LPS"]
+    head += ["# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"]
+    (tmp_path / "b.fcsv").write_text("\n".join([*head, *reversed(rows)]) + "\n")
+    table = read(tmp_path / "a.fcsv", tmp_path / "b.fcsv").table
+    kept = np.delete(np.arange(len(points)), 4)
+    np.testing.assert_allclose(table.before, points[kept], atol=1e-9)
+    np.testing.assert_allclose(table.after, moved(points)[kept], atol=1e-9)
+
+
+@pytest.mark.parametrize("units", ["um", ["m", "UCUM", "meter"]])
+def test_markups_in_another_unit_are_refused(tmp_path, points, units):
+    content = markups(points, [""] * len(points))
+    content["markups"][0]["coordinateUnits"] = units
+    (tmp_path / "a.mrk.json").write_text(json.dumps(content))
+    with pytest.raises(InputDataError, match="in mm"):
+        read(tmp_path / "a.mrk.json", tmp_path / "a.mrk.json")
 
 
 def test_the_term_is_zero_where_the_body_moves_as_measured(tmp_path, space, points):
@@ -137,6 +241,7 @@ def test_lps_read_as_ras_is_recognised(tmp_path, space, points):
         ("x,y,z\n1,2,3\n", "lacks the column"),
         ("before_x,before_y,before_z,after_x,after_y,after_z\n", "no pair of points"),
         ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2,nan,1,2,3\n", "no number"),
+        ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2,1e308,1,2,-1e308\n", "absurd"),
         ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2,three,1,2,3\n", "line 2"),
         ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2,3,1,2,3\n", "where they lay before"),
         ("before_x,before_y,before_z,after_x,after_y,after_z\n1,2\n", "no number"),
@@ -157,7 +262,14 @@ def test_a_field_of_a_row_or_two_is_no_field_but_a_marker_is_one(tmp_path, point
 
 
 @pytest.mark.parametrize(
-    "content", ["{}", "[", '{"markups": 3}', '{"markups": [{"controlPoints": [{"position": [1]}]}]}']
+    "content",
+    [
+        "{}",
+        "[",
+        '{"markups": 3}',
+        '{"markups": [{"controlPoints": [{"position": [1]}]}]}',
+        '{"markups": [{"coordinateUnits": [], "controlPoints": []}]}',
+    ],
 )
 def test_a_markups_file_that_is_none_is_refused(tmp_path, content):
     (tmp_path / "m.mrk.json").write_text(content)

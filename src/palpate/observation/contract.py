@@ -356,7 +356,7 @@ class DataFile:
 
     state: number of the later state, from 1; sd_mm: standard deviation of each component's errors; covariance_mm2 (3,
     3): of a point's error instead; correlation_mm: length over which errors of a field are alike, exp(-d / length);
-    axes: of the vectors of a field that is an image, "LPS" as ITK has them, or "RAS"; force_n on a surface along a
+    axes: of the vectors of a field, "LPS" or "RAS", "" where its file is to tell; force_n on a surface along a
     direction, with its standard deviation and that of the load cell's offset, N.
     """
 
@@ -367,7 +367,7 @@ class DataFile:
     sd_mm: float = 1.0
     covariance_mm2: NDArray[np.float64] | None = None
     correlation_mm: float = 0.0
-    axes: str = "LPS"
+    axes: str = ""
     surface: str = ""
     force_n: float = 0.0
     direction: tuple[float, float, float] = (0.0, 0.0, 1.0)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import re
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +16,7 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.findings import Finding
 from palpate.images.label_image import LPS_TO_RAS
+from palpate.images.named_labels import printable
 from palpate.mesh.locate import located
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.contract import DataFile, ReactionOf
@@ -26,8 +30,11 @@ from palpate.observation.measured_points import (
 )
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
 
+Marks = list[tuple[str, NDArray[np.float64]]]  # labels and points, RAS mm, NaN of one that was not placed
 TO_RAS = {"LPS": LPS_TO_RAS, "RAS": np.ones(3), "1": LPS_TO_RAS, "0": np.ones(3)}
-MOST_NAMED = 8  # points outside, by name
+NOWHERE = (np.nan, np.nan, np.nan)
+MOST_NAMED = 8  # points, by name
+PLACED = ("2", "")  # behind the columns that a .fcsv of 3D Slicer 5 names: 0 undefined, 1 preview, 3 missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,14 +46,12 @@ class Landmarks(MeasuredPoints):
         del reaction_of
         table, places = self.table, located(space.mesh, self.table.before)
         refuse_slips(space, table.before, places.inside, self.file.paths[0])
-        inside, findings = places.inside, list[Finding]()
+        inside, findings = places.inside, list(table.pairing)
         names = [name or f"number {number}" for number, name in enumerate(table.names, start=1)]
         if not inside.all():
-            out = [names[i] for i in np.flatnonzero(~inside)]
-            shown = ", ".join(out[:MOST_NAMED]) + (" ..." if len(out) > MOST_NAMED else "")
             text = (
-                f"{len(out)} of {len(inside)} landmarks of '{self.file.paths[0].name}' lie outside of the meshed body"
-                f" and are left out: {shown}"
+                f"{np.count_nonzero(~inside)} of {len(inside)} landmarks of '{self.file.paths[0].name}' lie outside of"
+                f" the meshed body and are left out: {_shown([names[i] for i in np.flatnonzero(~inside)])}"
             )
             findings.append(Finding("points-outside", text, place=f"in state {self.file.state}"))
         term = point_displacement(
@@ -62,65 +67,83 @@ class Landmarks(MeasuredPoints):
 
 
 def read_landmarks(file: DataFile) -> Landmarks:
-    """Read pairs of points: .csv of six columns, or one or two of .mrk.json and .fcsv.
+    """Read pairs of points: .csv of six columns, or one or two of .mrk.json and .fcsv; see `_pairs`.
 
-    Two lists of points are paired by their labels where these are the same and differ from each other, else by their
-    order. Raises `InputDataError` for whatever is wrong.
+    Raises `InputDataError` for whatever is wrong.
     """
     if file.paths[0].suffix.lower() == ".csv" and len(file.paths) == 1:
         return Landmarks(file, read_point_table(file.paths[0]))
-    lists, digests = list[list[tuple[str, NDArray[np.float64]]]](), []
+    lists, digests = list[Marks](), []
     for path in file.paths:
         content, digest = read_text(path)
         reader = _fcsv if path.name.lower().endswith(".fcsv") else _markups
         lists += reader(content, path)
         digests.append(digest)
-    where = " and ".join(f"'{path}'" for path in file.paths)
+    where = " and ".join(f"'{path.name}'" for path in file.paths)
     if len(lists) != 2:
         raise InputDataError(
             f"{where} hold {len(lists)} list(s) of points; landmarks need two, before and after: name two files,"
             " file and file_after"
         )
-    first, second = lists
-    if len(first) != len(second):
-        raise InputDataError(
-            f"{where} hold {len(first)} points before and {len(second)} after; every landmark needs both: take out"
-            " those that are seen once"
-        )
-    labels = [[label for label, _ in points] for points in lists]
-    if all(len(set(own)) == len(own) and all(own) for own in labels) and set(labels[0]) == set(labels[1]):
-        by_label = dict(second)
-        second = [(label, by_label[label]) for label in labels[0]]
-    table = PointTable(
-        np.array([point for _, point in first]),
-        np.array([point for _, point in second]),
-        tuple(labels[0]),
-        tuple(digests),
+    labels = [[label for label, _ in own] for own in lists]
+    pairs = np.array(_pairs(labels[0], labels[1], where), dtype=np.int64).reshape(-1, 2)
+    points = np.array([[own[n][1] for own, n in zip(lists, pair, strict=True)] for pair in pairs]).reshape(-1, 2, 3)
+    placed = np.isfinite(points).all(axis=(1, 2))
+    left = dict.fromkeys(
+        own[n] or f"number {n + 1}"
+        for own, used in zip(labels, pairs[placed].T, strict=True)
+        for n in np.setdiff1d(np.arange(len(own)), used)
     )
+    text = f"{len(left)} landmarks of {where} are not placed in both lists, and are left out: {_shown(list(left))}"
+    findings = (Finding("points-unpaired", text, place=f"in state {file.state}"),) if left else ()
+    names = tuple(labels[0][n] for n in pairs[placed, 0])
+    table = PointTable(points[placed, 0], points[placed, 1], names, tuple(digests), findings)
     return Landmarks(file, checked_table(table, file.paths[0]))
 
 
-def _markups(content: str, path: Path) -> list[list[tuple[str, NDArray[np.float64]]]]:
+def _pairs(first: Sequence[str], second: Sequence[str], where: str) -> list[tuple[int, int]]:
+    """Which points of two lists with these labels belong together.
+
+    Those with one label, where most have a partner so; else those whose labels end with one number ("before-7",
+    "after-7"), where most do; where no label tells, those of one place in lists of one length.
+    """
+    most = 0
+    for told in (r".+", r"\d+$"):
+        places = list[dict[str, int]]()
+        for own in (first, second):
+            names = [found[0] if (found := re.search(told, label)) else "" for label in own]
+            counts = Counter(names)
+            places.append({name: n for n, name in enumerate(names) if name and counts[name] == 1})
+        both = [(n, places[1][name]) for name, n in places[0].items() if name in places[1]]
+        if 2 * len(both) > min(len(first), len(second)):
+            return both
+        most = max(most, len(both))
+    if most or len(first) != len(second):
+        raise InputDataError(
+            f"{where} hold {len(first)} points before and {len(second)} after, of which {most} have a label that both"
+            " lists have once; give the two points of each landmark the same label"
+        )
+    return [(n, n) for n in range(len(first))]
+
+
+def _markups(content: str, path: Path) -> list[Marks]:
     """The lists of points of a .mrk.json of 3D Slicer."""
     lists = []
     try:
         for markup in json.loads(content)["markups"]:
             system = str(markup.get("coordinateSystem", "LPS")).upper()
-            units = str(markup.get("coordinateUnits", "mm"))  # a word, or a list with a code
-            if system not in TO_RAS or "mm" not in units:
+            units = markup.get("coordinateUnits", "mm")  # a word, or a list of a code, its scheme and its meaning
+            if system not in TO_RAS or (units[0] if isinstance(units, list) else units) != "mm":
                 raise InputDataError(
-                    f"'{path}' has coordinates in {system[:20]!r}, {units[:20]!r}; export LPS or RAS in mm"
+                    f"'{path}' has coordinates in {system[:20]!r}, {str(units)[:20]!r}; export LPS or RAS in mm"
                 )
             points = []
             for point in markup["controlPoints"]:
-                if point.get("positionStatus", "defined") != "defined":
-                    continue
-                position = np.array([float(x) for x in point["position"]], dtype=np.float64)
-                if position.shape != (3,):
-                    raise InputDataError(f"a control point of '{path}' has {len(position)} coordinates; export three")
-                points.append((str(point.get("label", ""))[:200], TO_RAS[system] * position))
+                placed = point.get("positionStatus", "defined") == "defined" and point.get("position") is not None
+                x, y, z = map(float, point["position"]) if placed else NOWHERE
+                points.append((printable(str(point.get("label", "")).strip()[:200]), TO_RAS[system] * (x, y, z)))
             lists.append(points)
-    except (ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, RecursionError, LookupError, TypeError, AttributeError) as error:
         raise InputDataError(
             f"'{path}' is no markups file of 3D Slicer ({type(error).__name__}: {error}); landmarks are read from"
             " .mrk.json, .fcsv and .csv"
@@ -128,20 +151,25 @@ def _markups(content: str, path: Path) -> list[list[tuple[str, NDArray[np.float6
     return lists
 
 
-def _fcsv(content: str, path: Path) -> list[list[tuple[str, NDArray[np.float64]]]]:
+def _fcsv(content: str, path: Path) -> list[Marks]:
     """The one list of points of a .fcsv of 3D Slicer; its head says LPS or RAS, by name or number."""
     head = [line[1:].split("=", 1) for line in content.splitlines() if line.startswith("#") and "=" in line]
     keys = {key.strip().lower(): value.strip() for key, value in head}
     system = keys.get("coordinatesystem", "0").upper()
-    columns = [name.strip().lower() for name in keys.get("columns", "id,x,y,z").split(",")]
+    columns = [name.strip().lower() for name in keys.get("columns", "label,x,y,z,sel,vis").split(",")]
     if system not in TO_RAS or not {"x", "y", "z"} <= set(columns):
         raise InputDataError(f"'{path}' states the coordinate system {system[:20]!r}; export it in LPS or RAS")
     points = []
-    for line in csv.reader(line for line in content.splitlines() if line.strip() and not line.startswith("#")):
-        row = dict(zip(columns, line, strict=False))
-        try:
-            position = np.array([float(row[axis]) for axis in "xyz"])
-        except (KeyError, ValueError) as error:
-            raise InputDataError(f"a line of '{path}' holds no point ({error}); export it again") from error
-        points.append((row.get("label", "").strip()[:200], TO_RAS[system] * position))
+    try:
+        for line in csv.reader(line for line in content.splitlines() if line.strip() and not line.startswith("#")):
+            row = dict(zip([*columns, "status"], line, strict=False))
+            placed = row.get("status", "") in PLACED
+            position = [float(row[axis]) for axis in "xyz"] if placed else NOWHERE
+            points.append((printable(row.get("label", "").strip()[:200]), TO_RAS[system] * position))
+    except (KeyError, ValueError, csv.Error) as error:
+        raise InputDataError(f"a line of '{path}' holds no point ({error}); export it again") from error
     return [points]
+
+
+def _shown(names: Sequence[str]) -> str:
+    return ", ".join(names[:MOST_NAMED]) + (" ..." if len(names) > MOST_NAMED else "")

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
+from palpate.findings import Finding
 from palpate.images.alignment import RigidMotion
 from palpate.images.input_file import read_input
 from palpate.images.label_image import LPS_TO_RAS
+from palpate.images.named_labels import printable
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.locate import located
 from palpate.mesh.space import LagrangeSpace
@@ -23,9 +25,13 @@ from palpate.observation.contract import DataFile
 MOST_BYTES = 64 * 2**20
 COLUMNS = tuple(f"{when}_{axis}" for when in ("before", "after") for axis in "xyz")
 METRES = 1000.0
+FARTHEST = 1e9  # mm
 SLIP = 0.5  # share of the points inside the mesh, from which on a slip explains them
-MOST_POINTS = 20_000  # whose direction is looked at
+MOST_POINTS = 20_000  # whose direction, or place, is looked at
 TELLING = 20  # points whose tissue tells where they went
+SEVERAL = 8  # points that tell how displacements change
+STRETCH = 0.5  # mm a mm, in every direction: more than any body's
+FLAT = 1e-6  # of the points' extent
 CLEARLY = 0.4  # share of these by which another reading must agree better
 OTHERWISE = {
     "from the later state to the first: give those that lead from the first to the later one": -np.ones(3),
@@ -36,12 +42,16 @@ OTHERWISE = {
 
 @dataclass(frozen=True, slots=True)
 class PointTable:
-    """Pairs of points (n, 3) RAS mm, before and after; names (n,), which may be empty; digests of the files."""
+    """Pairs of points (n, 3) RAS mm, before and after; names (n,), which may be empty; digests of the files.
+
+    `pairing`: what is to be said of how they were paired.
+    """
 
     before: NDArray[np.float64]
     after: NDArray[np.float64]
     names: tuple[str, ...]
     digests: tuple[str, ...]
+    pairing: tuple[Finding, ...] = ()
 
     @property
     def moved(self) -> NDArray[np.float64]:
@@ -119,7 +129,7 @@ def read_point_table(path: Path) -> PointTable:
                 raise InputDataError(
                     f"line {number} of '{path}' holds no six numbers ({error}); correct it, or take it out"
                 ) from error
-            labels.append((line.get("label") or "").strip()[:200])
+            labels.append(printable((line.get("label") or "").strip()[:200]))
     except csv.Error as error:
         raise InputDataError(f"the table '{path}' is damaged: {error}; export it again") from error
     values = np.array(rows, dtype=np.float64).reshape(-1, 2, 3)
@@ -143,18 +153,28 @@ def read_text(path: Path) -> tuple[str, str]:
 
 
 def checked_table(table: PointTable, path: Path) -> PointTable:
-    """The table itself, if it has points, all of them numbers; raises `InputDataError`."""
+    """The table itself, if it has points, all of them numbers, that move as a body does; raises `InputDataError`."""
     if len(table.before) == 0:
         raise InputDataError(f"'{path}' holds no pair of points; export it with at least one")
-    bad = np.flatnonzero(~np.isfinite(np.concatenate([table.before, table.after], axis=1)).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(np.concatenate([table.before, table.after], axis=1)) < FARTHEST).all(axis=1))
     if len(bad):
         raise InputDataError(
-            f"pair {bad[0] + 1} of '{path}' has a coordinate that is missing or no number ({len(bad)} of"
+            f"pair {bad[0] + 1} of '{path}' has a coordinate that is missing, no number or absurd ({len(bad)} of"
             f" {len(table.before)} pairs); take such pairs out"
         )
     if np.array_equal(table.before, table.after):
         raise InputDataError(
             f"the points of '{path}' lie where they lay before, to the last digit; give the later ones, too"
+        )
+    step = -(-len(table.before) // MOST_POINTS)
+    points, moved = (values[::step] - values.mean(axis=0) for values in (table.before, table.moved))
+    slopes = np.linalg.lstsq(points, moved, rcond=FLAT)[0]  # 0 across points that lie in a plane
+    least = float(np.linalg.svd(slopes)[1][-1])
+    if len(points) >= SEVERAL and least > STRETCH:  # a rotation leaves its axis where it is
+        raise InputDataError(
+            f"the displacements of '{path}' change by {least:.2g} mm or more for each mm between its points, in every"
+            " direction, as no body's do: they are positions in place of displacements, in another unit, or of other"
+            " points; correct the file"
         )
     return table
 
@@ -164,7 +184,7 @@ def refuse_slips(space: LagrangeSpace, points: NDArray[np.float64], inside: NDAr
 
     inside (n,): which of them lie in it.
     """
-    share = float(inside.mean())
+    share, points = float(inside.mean()), points[:: -(-len(inside) // MOST_POINTS)]
     slips = {
         "x and y had the other sign: LPS read as RAS": points * LPS_TO_RAS,
         "they were written in metres": points * METRES,
@@ -180,7 +200,7 @@ def refuse_slips(space: LagrangeSpace, points: NDArray[np.float64], inside: NDAr
     if not inside.any():
         low, high = points.min(axis=0).round(1).tolist(), points.max(axis=0).round(1).tolist()
         raise InputDataError(
-            f"none of the {len(points)} points of '{path}' lies in the meshed body: they lie between {low} and"
+            f"none of the {len(inside)} points of '{path}' lies in the meshed body: they lie between {low} and"
             f" {high} mm (RAS); give points of this patient, in the world of the first image"
         )
 

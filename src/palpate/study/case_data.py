@@ -23,9 +23,9 @@ class CaseData:
     """Measurements beside the images, of the later state with the number `state`; `file_after`: of a second list.
 
     `sd_mm`: standard deviation of each component's error, or `covariance_mm2` (3, 3) of a point's; `correlation_mm`:
-    length over which a field's errors are alike; `axes`: of the vectors of a field that is an image. A force has no
-    file: `force_n` on `surface` (see `CaseLoad`) along `direction`, with `sd_n` and that of the load cell's offset,
-    `offset_sd_n`.
+    length over which a field's errors are alike; `axes`: of a field's vectors, where its file does not tell. A force
+    has no file: `force_n` on `surface` (see `CaseLoad`) along `direction`, with `sd_n` and that of the load cell's
+    offset, `offset_sd_n`.
     """
 
     kind: str = field(metadata=rule(choices=tuple(SOURCES)))
@@ -35,7 +35,7 @@ class CaseData:
     sd_mm: float | None = field(default=None, metadata=rule(between=(1e-6, 100.0)))
     covariance_mm2: tuple[Row, Row, Row] | None = field(default=None, metadata=rule(instead_of="sd_mm"))
     correlation_mm: float = field(default=0.0, metadata=rule(between=(0.0, 1e3)))
-    axes: str = field(default="LPS", metadata=rule(choices=("LPS", "RAS")))
+    axes: str | None = field(default=None, metadata=rule(choices=("LPS", "RAS")))
     surface: str | None = None
     force_n: float | None = field(default=None, metadata=rule(between=FORCES_N))
     direction: Row | None = field(default=None, metadata=rule(between=(-1e3, 1e3)))
@@ -84,7 +84,7 @@ class CaseData:
             sd_mm,
             matrix,
             self.correlation_mm,
-            self.axes,
+            self.axes or "",
             self.surface or "",
             self.force_n or 0.0,
             self.direction or (0.0, 0.0, 1.0),
