@@ -6,7 +6,7 @@ import hashlib
 import io
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
@@ -27,15 +27,17 @@ MOST_FILES = 5000  # in the folder of a segmentation and those in it
 MOST_BYTES = 2**31  # of a segmentation
 MOST_SLICE_BYTES = 2**26  # of another file beside it, to be one of its series
 UNEVEN = 0.02  # of the distance between slices
-PLACE = ("SeriesInstanceUID", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing", "Rows", "Columns")
+STACKED = ("ImageOrientationPatient", "PixelSpacing", "Rows", "Columns")
+PLACE = ("SeriesInstanceUID", "SOPInstanceUID", "ImagePositionPatient", *STACKED)
 
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """The grid of a series, in the order closest to RAS; SHA-256 of its files, empty where there are none."""
+    """The grid of a series, in the order closest to RAS; SHA-256 of its files and its UID, empty without a series."""
 
     grid: VoxelGrid
     sha256: str = ""
+    uid: str = ""
 
 
 @contextmanager
@@ -63,28 +65,31 @@ def read_dataset(path: Path) -> tuple[Dataset, str]:
     return pydicom.dcmread(io.BytesIO(content)), sha256
 
 
-def series_beside(path: Path, uid: str) -> Series | None:
-    """The grid of the series `uid`, if its slices lie in the folder of `path` or in one there; no link is followed.
+def series_beside(path: Path, uids: Sequence[str]) -> Series | None:
+    """The grid of the first of the series `uids` (of one, or of a slice) whose slices lie in the folder of `path`.
 
-    Raises `InputDataError` when they are no stack of evenly spaced slices.
+    Folders in it are searched, too; no link is followed. Raises `InputDataError` when the slices are no stack that is
+    evenly spaced.
     """
-    found: list[tuple[Dataset, str]] = []
+    stacks: dict[str, dict[str, tuple[Dataset, str]]] = {}  # a slice that lies there twice counts once
     for file in islice(_files(path.parent), MOST_FILES):
         content, sha256 = read_input(file, MOST_SLICE_BYTES)
         if content[128:132] != b"DICM" or len(content) > MOST_SLICE_BYTES:
             continue
         head = pydicom.dcmread(io.BytesIO(content), stop_before_pixels=True, specific_tags=list(PLACE))
-        if head.get("SeriesInstanceUID") == uid and all(name in head for name in PLACE):
-            found.append((head, sha256))
-    if not found:
+        if all(name in head for name in PLACE):
+            stacks.setdefault(str(head.SeriesInstanceUID), {})[str(head.SOPInstanceUID)] = head, sha256
+    uid = next((uid for each in uids for uid, stack in stacks.items() if each == uid or each in stack), None)
+    if uid is None:
         return None
+    found = list(stacks[uid].values())
     first = found[0][0]
     across, down = np.array(first.ImageOrientationPatient, dtype=np.float64).reshape(2, 3)
     normal = np.cross(across, down)
     alike = [
         (np.array(head.ImagePositionPatient, dtype=np.float64), digest)
         for head, digest in found
-        if all(head.get(name) == first.get(name) for name in PLACE[2:])
+        if all(head.get(name) == first.get(name) for name in STACKED)
     ]
     alike.sort(key=lambda slice_: float(slice_[0] @ normal))
     places = np.array([place for place, _ in alike])
@@ -104,7 +109,7 @@ def series_beside(path: Path, uid: str) -> Series | None:
     shape = (len(alike), int(first.Rows), int(first.Columns))
     check_size(shape, 0, path, available=0, packed=False)
     empty, affine = to_canonical(np.zeros(shape, dtype=np.uint8), LPS_AFFINE @ lps)
-    return Series(VoxelGrid((empty.shape[0], empty.shape[1], empty.shape[2]), affine), total)
+    return Series(VoxelGrid((empty.shape[0], empty.shape[1], empty.shape[2]), affine), total, uid)
 
 
 def _files(folder: Path) -> Iterator[Path]:
