@@ -66,6 +66,7 @@ Harmless = Literal[
     "memory-now",
     "report",
     "case-file",
+    "names-left-out",
     "earlier-files",
 ]
 Code = Misleading | Widening | Harmless

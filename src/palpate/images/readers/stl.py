@@ -77,9 +77,9 @@ def read_stl(path: Path) -> SurfaceFile:
     triangles = numbers.reshape(-1, 3)
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]  # of two corners in one place
     edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    edge, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)[1:]
-    turns = np.bincount(edge.reshape(-1), weights=np.sign(edges[:, 1] - edges[:, 0]), minlength=len(count))
-    open_, opposed = np.count_nonzero(count % 2), np.count_nonzero(turns[count % 2 == 0])
+    edge, shared = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)[1:]
+    turns = np.bincount(edge.reshape(-1), weights=np.sign(edges[:, 1] - edges[:, 0]), minlength=len(shared))
+    open_, opposed = np.count_nonzero(shared % 2), np.count_nonzero(turns[shared % 2 == 0])
     if not len(triangles) or open_:
         raise InputDataError(
             f"'{path}' is not closed ({len(triangles)} triangles, {open_} edges of an odd number of them), so that it"
@@ -87,7 +87,7 @@ def read_stl(path: Path) -> SurfaceFile:
         )
     if opposed:
         raise InputDataError(
-            f"the triangles beside {opposed} of {len(count)} edges of '{path}' face opposite ways, so that inside and"
+            f"the triangles beside {opposed} of {len(shared)} edges of '{path}' face opposite ways, so that inside and"
             " outside cannot be told apart; recalculate its normals where it was made (Blender: Mesh, Normals,"
             " Recalculate Outside; MeshLab: Re-Orient all faces coherently)"
         )
