@@ -19,7 +19,7 @@ from typing import Any
 
 from palpate.errors import InputDataError
 from palpate.findings import Finding
-from palpate.images.input_file import read_input
+from palpate.images.input_file import whole_input
 from palpate.images.named_labels import (
     MAX_LABEL,
     MAX_NAME,
@@ -65,12 +65,7 @@ def read_label_table(path: Path | str) -> LabelTable:
             f"no reader for the label table '{path}': the endings known are {', '.join(ENDINGS)}; write it as JSON,"
             ' {"1": "prostate"}'
         )
-    try:
-        content, sha256 = read_input(path, MAX_BYTES)
-    except (OSError, ValueError) as error:
-        raise InputDataError(f"the label table '{path}' cannot be read ({error}); check the path") from error
-    if len(content) > MAX_BYTES:
-        raise InputDataError(f"the label table '{path}' is larger than {MAX_BYTES} bytes; is it another file?")
+    content, sha256 = whole_input(path, MAX_BYTES)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

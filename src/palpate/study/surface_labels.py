@@ -24,9 +24,8 @@ MOST_VOXELS = 2**28
 MOST_SURFACES = 500
 AT_ONCE = 2**20  # voxels of a surface that are asked together
 HALF = 0.5  # a turn: nearer to one than to none
-FEWEST = 50  # voxels of an organ that an estimate takes
 LIKELY_MM3 = (100.0, 2e8)  # of what is segmented: a seed, a whole body
-DOUBTFUL = 0.25  # of a voxel, by which the whole surface would have to lie elsewhere
+DOUBTFUL = 0.2  # of the volume, more than voxels cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +94,7 @@ def surface_labels(
     if (size := float(np.prod([float(n) for n in grid.shape]))) > MOST_VOXELS:
         raise ResourceError(
             f"the grid would have {size:.3g} voxels, over {MOST_VOXELS}; take larger ones, or less margin"
-            f"{_other_unit(surfaces[0])}"
+            f"{next(filter(None, map(_other_unit, surfaces)), '')}"
         )
     counts, findings = dict[str, int](), list[Finding]()
 
@@ -134,14 +133,12 @@ def _flaws(name: str, surface: SurfaceFile, count: int, grid: VoxelGrid) -> list
             f"{advice}"
         )
     found = []
-    if count < FEWEST:
-        found.append(Finding("too-small", f"'{name}' has {count} voxels and holds {volume}{advice}", name))
     index = grid.index(surface.points)
     beyond = bool(((index < -0.5) | (index > np.array(grid.shape) - 0.5)).any())
     if beyond and counted < held:
         text = f"the grid ends in '{name}': {1.0 - counted / held:.1%} of its {volume} lies beyond; take a larger image"
         found.append(Finding("cut-by-border", text, name))
-    elif abs(counted - held) > DOUBTFUL * grid.spacing.mean() * surface.area_mm2:
+    elif abs(counted - held) > DOUBTFUL * held:
         text = (
             f"the triangles of '{name}' hold {volume}, its voxels {counted / 1000.0:.3g} mL: pieces of it overlap, are"
             " in the file twice, or are turned inside out; make one surface of them where it was made"

@@ -121,9 +121,9 @@ def test_contours_of_sparser_or_finer_planes_make_slices_which_are_named(tmp_pat
     save_series(tmp_path / "ct", slices)
     square = np.array([[0, 9.5, 9.5], [0, 9.5, 19.5], [0, 29.5, 19.5], [0, 29.5, 9.5]])
     cases = (
-        ((2, 4, 6), 6, "2 at S 21, 27 mm interpolated; planes every 6 mm, slices every 3 mm"),
+        ((2, 4, 6), 6, "2 at S 21, 27 mm interpolated; its planes every 6 mm"),
         (np.arange(2, 6.1, 0.5), 5, ""),
-        ((2.5, 3.5), 2, "1 at S 21 mm interpolated; planes every 3 mm"),
+        ((2.5, 3.5), 2, "1 at S 21 mm interpolated; its planes every 3 mm"),
         ((4,), 1, ""),
         ((2, 3, 5, 6), 5, "1 at S 24 mm interpolated"),
         ((2, 3, 4, 9, 10), 5, "4 at S 27, 30, 33, 36 mm left empty"),

@@ -20,7 +20,7 @@ from palpate.images.label_image import LPS_TO_RAS, VoxelGrid
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, hex_colour, printable
 from palpate.images.readers.dicom_dataset import Series, read_dataset, sentences, series_beside
 from palpate.images.readers.merged_masks import Mask, merged
-from palpate.images.readers.planar_contours import Body, Contour, body, distance_of, distinct
+from palpate.images.readers.planar_contours import Contour, body, distinct
 from palpate.images.readers.registry import StoredImage
 
 EXCLUSIVE = "CLOSEDPLANAR_XOR"
@@ -102,11 +102,12 @@ def _rows(dataset: Dataset, drawn: Mapping[int, list[Dataset]]) -> Iterator[tupl
     often = Counter(names.get(number) for number, contours in drawn.items() if contours)
     usable = 1 <= min(drawn, default=0) <= max(drawn, default=0) <= MAX_LABEL
     for place, (number, contours) in enumerate(drawn.items(), start=1):
-        label, name = number if usable else place, names.get(number) or f"structure {number}"
-        row = NamedLabel(label, f"{name} (ROI {number})" if often[name] > 1 else name)
-        if len(colours.get(number, ())) == 3:
-            row = NamedLabel(label, row.name, hex_colour(*map(float, colours[number]), top=255))
-        yield row, str(rois.get(number, Dataset()).get("ReferencedFrameOfReferenceUID")), contours
+        name = names.get(number) or f"structure {number}"
+        name = f"{name} (ROI {number})" if often[name] > 1 else name
+        rgb = [float(part) for part in colours.get(number, ())]
+        colour = hex_colour(*rgb, top=255) if len(rgb) == 3 else None
+        frame = str(rois.get(number, Dataset()).get("ReferencedFrameOfReferenceUID"))
+        yield NamedLabel(number if usable else place, name, colour), frame, contours
 
 
 def _structure(row: NamedLabel, contours: list[Dataset], grid: VoxelGrid, axis: int, path: Path) -> _Structure:
@@ -145,38 +146,29 @@ def _masks(
     structures: list[_Structure], shape: tuple[int, int, int], grid: VoxelGrid, axis: int, findings: list[Finding]
 ) -> Iterator[Mask]:
     """The voxels of each structure in turn; after the last, `findings` tell what was left out or filled."""
-    flaws, sparse = list[str](), list[str]()
+    left_out, changed = list[str](), list[str]()
+    middle = 0.5 * (np.array(grid.shape) - 1.0)
+
+    def places(slices: list[int]) -> str:
+        index = np.where(np.arange(3) == axis, np.array(slices)[:, None], middle)
+        heights = ", ".join(f"{mm:.4g}" for mm in grid.world(index[:MOST_SHOWN])[:, axis])
+        return f"{len(slices)} at {'RAS'[axis]} {heights}{', ...' * (len(slices) > MOST_SHOWN)} mm"
+
     for each in structures:
-        parts = list(each.flaws)
+        flaws = list(each.flaws)
         if each.planes:
-            found = body(each.heights, each.planes, shape, exclusive=each.exclusive)
-            parts += [f"contours that cross on {found.crossing} planes"] if found.crossing else []
-            parts += [] if found.inside.any() else ["no voxel"]
-            sparse += _slices(each, found, grid, axis)
-            yield Mask(each.row, found.inside)
-        flaws += [f"'{each.row.name}' ({' and '.join(parts)})"] if parts else []
-    findings += _listed(
-        "open-contours", "contours were left out, joined where they cross, or cut with the series", flaws
+            inside, noted = body(each.heights, each.planes, shape, exclusive=each.exclusive)
+            flaws += [] if inside.any() else ["no voxel"]
+            words = [f"{places(slices)} {kind}" for kind, slices in noted.items() if slices]
+            apart = sorted({round(float(step), 2) for step in np.diff(each.heights) * grid.spacing[axis]})
+            every = " to ".join(f"{mm:.3g}" for mm in apart[:: max(len(apart) - 1, 1)])
+            changed += [f"'{each.row.name}' ({'; '.join(words)}; its planes every {every} mm)"] if words else []
+            yield Mask(each.row, inside)
+        left_out += [f"'{each.row.name}' ({' and '.join(flaws)})"] if flaws else []
+    said: tuple[tuple[Code, str, list[str]], ...] = (
+        ("open-contours", "contours were left out, or are cut with the series", left_out),
+        ("sparse-contours", f"slices every {grid.spacing[axis]:.3g} mm are not as contours were drawn", changed),
     )
-    findings += _listed("sparse-contours", "slices have no contour of their own", sparse)
-
-
-def _slices(structure: _Structure, found: Body, grid: VoxelGrid, axis: int) -> list[str]:
-    """Which slices were interpolated between planes, and which were left empty there."""
-    spacing = float(grid.spacing[axis])
-    every = f"planes every {distance_of(structure.heights) * spacing:.3g} mm, slices every {spacing:.3g} mm"
-    parts = []
-    for slices, what in ((found.between, "interpolated"), (found.empty, "left empty, too far from the next plane")):
-        index = np.tile(0.5 * (np.array(grid.shape) - 1.0), (len(slices), 1))
-        index[:, axis] = slices
-        places = ", ".join(f"{mm:.4g}" for mm in grid.world(index[:MOST_SHOWN])[:, axis])
-        more = ", ..." if len(slices) > MOST_SHOWN else ""
-        parts += [f"{len(slices)} at {'RAS'[axis]} {places}{more} mm {what}"] if slices else []
-    return [f"'{structure.row.name}' ({'; '.join([*parts, every])})"] if parts else []
-
-
-def _listed(code: Code, text: str, parts: list[str]) -> list[Finding]:
-    more = ", ..." if len(parts) > MOST_SHOWN else ""
-    return (
-        [Finding(code, f"{text}: {', '.join(parts[:MOST_SHOWN])}{more}; look at them, or draw them")] if parts else []
-    )
+    for code, text, parts in said:
+        shown = f"{', '.join(parts[:MOST_SHOWN])}{', ...' * (len(parts) > MOST_SHOWN)}"
+        findings += [Finding(code, f"{text}: {shown}; look at them, or draw them")] if parts else []

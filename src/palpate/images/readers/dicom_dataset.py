@@ -17,7 +17,7 @@ import pydicom
 from pydicom.dataset import Dataset
 
 from palpate.errors import InputDataError, PalpateError
-from palpate.images.input_file import read_input
+from palpate.images.input_file import read_input, whole_input
 from palpate.images.label_image import LPS_TO_RAS, VoxelGrid
 from palpate.images.readers.values import to_canonical
 from palpate.images.readers.voxel_stream import check_size
@@ -57,11 +57,7 @@ def sentences(path: Path) -> Iterator[None]:
 
 def read_dataset(path: Path) -> tuple[Dataset, str]:
     """The data set in the file `path` and the SHA-256 (hexadecimal) of the file."""
-    content, sha256 = read_input(path, MOST_BYTES)
-    if len(content) > MOST_BYTES:
-        raise InputDataError(
-            f"'{path}' is larger than {MOST_BYTES} bytes; save a segmentation of fewer slices or organs"
-        )
+    content, sha256 = whole_input(path, MOST_BYTES)
     return pydicom.dcmread(io.BytesIO(content)), sha256
 
 
@@ -85,18 +81,12 @@ def series_beside(path: Path, uids: Sequence[str]) -> Series | None:
     found = list(stacks[uid].values())
     first = found[0][0]
     across, down = np.array(first.ImageOrientationPatient, dtype=np.float64).reshape(2, 3)
-    normal = np.cross(across, down)
-    alike = [
-        (np.array(head.ImagePositionPatient, dtype=np.float64), digest)
-        for head, digest in found
-        if all(head.get(name) == first.get(name) for name in STACKED)
-    ]
-    alike.sort(key=lambda slice_: float(slice_[0] @ normal))
-    places = np.array([place for place, _ in alike])
-    steps = np.diff(places, axis=0)
-    step = steps.mean(axis=0) if len(steps) else normal
-    even = bool(len(steps)) and float(np.abs(steps - step).max()) <= UNEVEN * float(np.linalg.norm(step))
-    if len(alike) < len(found) or not even:
+    places = np.array([head.ImagePositionPatient for head, _ in found], dtype=np.float64)
+    order = np.argsort(places @ np.cross(across, down))
+    steps = np.diff(places[order], axis=0)
+    step = steps.mean(axis=0) if len(steps) else np.zeros(3)
+    alike = all(head.get(name) == first.get(name) for head, _ in found for name in STACKED)
+    if not alike or not len(steps) or float(np.abs(steps - step).max()) > UNEVEN * float(np.linalg.norm(step)):
         raise InputDataError(
             f"the {len(found)} slices beside '{path}' of the series that it refers to are no stack of one size and even"
             " distance; put one complete series there"
@@ -104,22 +94,18 @@ def series_beside(path: Path, uids: Sequence[str]) -> Series | None:
     spacing = [float(number) for number in first.PixelSpacing]  # between rows, then between columns
     lps = np.eye(4)
     lps[:3, :3] = np.stack([step, down * spacing[0], across * spacing[1]], axis=1)
-    lps[:3, 3] = places[0]
-    total = hashlib.sha256("".join(digest for _, digest in alike).encode()).hexdigest()
-    shape = (len(alike), int(first.Rows), int(first.Columns))
+    lps[:3, 3] = places[order[0]]
+    total = hashlib.sha256("".join(found[k][1] for k in order).encode()).hexdigest()
+    shape = (len(found), int(first.Rows), int(first.Columns))
     check_size(shape, 0, path, available=0, packed=False)
     empty, affine = to_canonical(np.zeros(shape, dtype=np.uint8), LPS_AFFINE @ lps)
     return Series(VoxelGrid((empty.shape[0], empty.shape[1], empty.shape[2]), affine), total, uid)
 
 
-def _files(folder: Path) -> Iterator[Path]:
+def _files(folder: Path, depth: int = 1) -> Iterator[Path]:
     with os.scandir(folder) as entries:
         inside = sorted(entries, key=lambda entry: entry.name)
+    yield from (Path(entry.path) for entry in inside if entry.is_file(follow_symlinks=False))
     for entry in inside:
-        if entry.is_file(follow_symlinks=False):
-            yield Path(entry.path)
-    for entry in inside:
-        if entry.is_dir(follow_symlinks=False):
-            with os.scandir(entry.path) as deeper:
-                files = sorted(each.path for each in deeper if each.is_file(follow_symlinks=False))
-            yield from map(Path, files)
+        if depth and entry.is_dir(follow_symlinks=False):
+            yield from _files(Path(entry.path), depth - 1)

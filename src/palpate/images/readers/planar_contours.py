@@ -21,21 +21,8 @@ ON_SLICE = 0.05  # slices between a plane and the slice that it was drawn on
 SAME = 0.2  # of a voxel, between the points of a contour and those of its copy, which may be rounded
 WITHIN = 0.95  # of a contour's pixels in another one: it is a hole
 FILLED = 3.05  # planes' distances: no longer gap between planes is filled
+INTERPOLATED, EMPTY, JOINED = "interpolated", "left empty, far from the next plane", "joined, for contours cross there"
 STEP, MOST_STEPS = 0.25, 4000  # pixels between points along an edge, from which distances are measured
-
-
-@dataclass(frozen=True, slots=True)
-class Body:
-    """Voxels `inside` (n_slices, n_rows, n_columns), and how planes became slices.
-
-    between: slices that were interpolated; empty: those between planes too far apart to do so; crossing: planes on
-    which contours cross each other.
-    """
-
-    inside: NDArray[np.bool_]
-    between: tuple[int, ...]
-    empty: tuple[int, ...]
-    crossing: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,25 +55,17 @@ def distinct(contours: Sequence[Contour]) -> list[Contour]:
     return [contours[number] for number in kept]
 
 
-def distance_of(heights: NDArray[np.float64]) -> float:
-    """Of the planes from one another, slices."""
-    return float(np.median(np.diff(heights))) if len(heights) > 1 else 1.0
-
-
 def body(
     heights: NDArray[np.float64], planes: Sequence[Sequence[Contour]], shape: tuple[int, int, int], *, exclusive: bool
-) -> Body:
-    """The body (n_slices, n_rows, n_columns) of planes at ascending `heights` (n,); `exclusive`: as for `_drawn`."""
-    crossing, between, empty = set[int](), list[int](), list[int]()
+) -> tuple[NDArray[np.bool_], dict[str, list[int]]]:
+    """Voxels (n_slices, n_rows, n_columns) of planes at ascending `heights` (n,), and slices that are not as drawn.
 
-    @lru_cache(maxsize=2)
-    def plane(number: int) -> _Plane:
-        found = _drawn(planes[number], shape[1:], exclusive=exclusive)
-        crossing.update({number} if found.crossed else ())
-        return found
-
+    exclusive: contours that cross each other are not joined, but exclude each other.
+    """
+    plane = lru_cache(maxsize=2)(lambda number: _drawn(planes[number], shape[1:], exclusive=exclusive))
     inside = np.zeros(shape, dtype=bool)
-    apart = distance_of(heights)
+    noted: dict[str, list[int]] = {INTERPOLATED: [], EMPTY: [], JOINED: []}
+    apart = float(np.median(np.diff(heights))) if len(heights) > 1 else 1.0
     for k in range(shape[0]):
         above, nearest = int(np.searchsorted(heights, k)), int(np.argmin(np.abs(heights - k)))
         away, held = abs(float(heights[nearest]) - k), 0 < above < len(heights)
@@ -94,14 +73,15 @@ def body(
         part = min(1.0, 0.5 * apart + 0.5 - away)  # of the slice, as far as the last plane reaches
         if away <= ON_SLICE:
             inside[k] = plane(nearest).area
+            noted[JOINED] += [k] * plane(nearest).crossed
         elif held and gap <= FILLED * max(apart, 1.0):
             inside[k] = _between(plane(above - 1), plane(above), (k - float(heights[above - 1])) / gap)
-            between.append(k)
+            noted[INTERPOLATED].append(k)
         elif part > ON_SLICE:
             inside[k] = _deepest(plane(nearest), part)
         elif held:
-            empty.append(k)
-    return Body(inside, tuple(between), tuple(empty), len(crossing))
+            noted[EMPTY].append(k)
+    return inside, noted
 
 
 def _between(first: _Plane, second: _Plane, share: float) -> NDArray[np.bool_]:
@@ -126,11 +106,7 @@ def _deepest(plane: _Plane, part: float) -> NDArray[np.bool_]:
 
 
 def _drawn(contours: Sequence[Contour], shape: tuple[int, int], *, exclusive: bool) -> _Plane:
-    """A plane (n_rows, n_columns) of contours.
-
-    A contour in another one is a hole, one in a hole an island; those that cross are joined, unless the file calls for
-    the exclusive or.
-    """
+    """A plane (n_rows, n_columns): a contour in another one is a hole, one in a hole an island."""
     found, crossed = np.zeros(shape, dtype=bool), False
     for contour in sorted(contours, key=lambda of: -float(np.prod(np.ptp(of, axis=0)))):
         low = np.clip(np.floor(contour.min(axis=0)) - 1, 0, shape).astype(int)

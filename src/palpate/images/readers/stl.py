@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.images.input_file import read_input
+from palpate.images.input_file import whole_input
 
 MOST_BYTES = 2**29
 MOST_TEXT = 2**26  # bytes: its numbers take some ten times as much memory while they are read
@@ -37,12 +37,6 @@ class SurfaceFile:
         a, b, c = np.moveaxis(self.points[self.triangles] - self.points[0], 1, 0)
         return float(abs(np.einsum("ni,ni->n", a, np.cross(b, c)).sum()) / 6.0)
 
-    @property
-    def area_mm2(self) -> float:
-        """Area of the triangles, mm^2."""
-        a, b, c = np.moveaxis(self.points[self.triangles], 1, 0)
-        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
-
 
 def read_stl(path: Path) -> SurfaceFile:
     """Read a closed surface, mm; corners that lie in one place are one point.
@@ -50,12 +44,7 @@ def read_stl(path: Path) -> SurfaceFile:
     Raises `InputDataError` for what is no STL, holds what is no number, is not closed (an edge of an odd number of
     triangles leaves no inside), or has triangles that face opposite ways.
     """
-    try:
-        content, digest = read_input(path, MOST_BYTES)
-    except (OSError, ValueError) as error:
-        raise InputDataError(f"'{path}' cannot be read: {error}; check the path") from error
-    if len(content) > MOST_BYTES:
-        raise InputDataError(f"'{path}' is larger than {MOST_BYTES // 2**20} MB; simplify the surface")
+    content, digest = whole_input(path, MOST_BYTES)
     count = int.from_bytes(content[HEADING : HEADING + 4], "little")
     if len(content) == HEADING + 4 + count * FACET.itemsize:
         corners = np.asarray(np.frombuffer(content, FACET, count, HEADING + 4)["corners"], dtype=np.float64)
