@@ -46,7 +46,8 @@ def read_stl(path: Path) -> SurfaceFile:
     """
     content, digest = whole_input(path, MOST_BYTES)
     count = int.from_bytes(content[HEADING : HEADING + 4], "little")
-    if len(content) >= HEADING + 4 + count * FACET.itemsize:  # those bytes of a text are a huge number
+    whole = HEADING + 4 + count * FACET.itemsize  # those bytes of a text are a huge number
+    if len(content) == whole or (count and len(content) > whole):
         corners = np.asarray(np.frombuffer(content, FACET, count, HEADING + 4)["corners"], dtype=np.float64)
     elif content.lstrip()[:5].lower() != b"solid":
         raise InputDataError(
