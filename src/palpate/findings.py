@@ -67,6 +67,7 @@ Harmless = Literal[
     "memory-now",
     "report",
     "case-file",
+    "names-left-out",
     "earlier-files",
 ]
 Code = Misleading | Widening | Harmless

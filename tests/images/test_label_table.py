@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from palpate.errors import InputDataError
+from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.label_table import read_label_table, slicer_table
 from palpate.images.named_labels import NamedLabel
+from palpate.images.readers import read_label_image, write_label_image
 
 
 @pytest.mark.parametrize(
@@ -19,6 +22,9 @@ from palpate.images.named_labels import NamedLabel
         '{"1": "prostate", "2": "bladder"}',
         '{"bladder": 2, "prostate": 1}',
         '\ufeff{"1": " prostate ", "2": "bladder"}',
+        '{"labels": {"bladder": [2], "prostate": 1}, "regions_class_order": [2, 1]}',
+        '{"network": {"outputs": {"pred": {"type": "image", "channel_def": {"1": "prostate", "2": "bladder"}}}}}',
+        '{"1": "prostate", "bladder": 2, "prostate": 1}',
     ],
 )
 def test_every_spelling_gives_the_same_table(tmp_path: Path, text: str) -> None:
@@ -61,6 +67,10 @@ TABLES = {
     "slicer.csv": "LabelValue,Name,Color_R,Color_G,Color_B,Color_A\n2,bladder,0,255,0,255\n1,left hip,255,0,128,255\n",
     "terms.csv": "Name,LabelValue,Color_R,Color_G,Color_B,Type_CodeMeaning\r\n"
     '"left hip",1,255,0,128,"Bone, hip"\r\n"bladder",2,0,255,0,\r\n',
+    "lines.ctbl": "# Color table file\r\n# 2 values\r\n1 left hip 255 0 128 255 whatever\r\n2 bladder 0 255 0 255\r\n",
+    "terms_of_type.csv": "LabelValue;Name;Color_R;Color_G;Color_B\n1;left hip;255;0;128\n2;bladder;0;255;0\n",
+    "more.label": '\ufeff1\t255\t0\t128\t1\t1\t1\t0 0.5 "left hip" x\r\n'
+    '2 0 255 0 "bladder"\r\n2 0 255 0 1 1 1 "bladder"\r\n',
     "sub-1_dseg.tsv": "index\tname\tabbreviation\tcolor\n1\tleft hip\tH\t#FF0080\n2\tbladder\tB\t#00ff00\n",
 }
 
@@ -79,6 +89,52 @@ def test_a_colour_table_keeps_its_names_as_they_stand_there(tmp_path: Path, name
     table = read_label_table(tmp_path / name)
     assert dict(table) == {1: "left_hip", 2: "bladder"}
     assert table.colours == {1: "#ff0080", 2: "#00ff00"}
+
+
+@pytest.mark.parametrize(
+    ("labels", "order", "names", "words"),
+    [
+        (
+            '"background": 0, "gland": [1, 3], "rectum": 2',
+            "[1, 2]",
+            {0: "background", 2: "rectum"},
+            "[1, 3], in a prediction [1]",
+        ),
+        (
+            '"background": 0, "kidney": [1, 2, 3], "tumour": 2',
+            "[1, 2]",
+            {0: "background", 2: "tumour"},
+            "in a prediction [1, 2]",
+        ),
+        (
+            '"whole": [1, 2, 3], "core": [2, 3], "live": 3',
+            "[1, 2, 3]",
+            {3: "live"},
+            "'whole' ([1, 2, 3]), 'core' ([2, 3]);",
+        ),
+        (
+            '"a": [1, 2], "b": 3, "c": 4',
+            "[1, 2, 4]",
+            {4: "c"},
+            "'a' ([1, 2], in a prediction [1]), 'b' ([3], in a prediction [2])",
+        ),
+        ('"a": [1, 2], "b": 3', '"x"', {3: "b"}, "'a' ([1, 2]);"),
+    ],
+)
+def test_regions_are_left_out_and_told_with_what_to_write(tmp_path: Path, labels, order, names, words) -> None:
+    path = tmp_path / "dataset.json"
+    path.write_text(f'{{"labels": {{{labels}}}, "regions_class_order": {order}}}')
+    table = read_label_table(path)
+    assert dict(table) == names
+    (finding,) = table.findings
+    assert finding.code == "names-left-out"
+    assert words in finding.message
+    image = LabelImage(np.zeros((2, 2, 2), np.uint8), VoxelGrid((2, 2, 2), np.eye(4)))
+    write_label_image(tmp_path / "a.nii.gz", image)
+    assert read_label_image(tmp_path / "a.nii.gz", names=table).findings == table.findings
+    path.write_text('{"labels": {"gland": [1, 3]}}')
+    with pytest.raises(InputDataError, match=r"names no label.*'gland' \(\[1, 3\]\); write the numbers"):
+        read_label_table(path)
 
 
 def test_a_table_without_colours_or_with_impossible_ones_has_none(tmp_path: Path) -> None:
@@ -100,13 +156,14 @@ def test_a_table_without_colours_or_with_impossible_ones_has_none(tmp_path: Path
     ("name", "text", "words"),
     [
         ("a.txt", '1 255 0 0 1 1 1 "a"\n2 0 0 0\n', "line 2"),
-        ("a.txt", "1,prostate\n", "does not look like"),
-        ("a.txt", "", "does not look like"),
+        ("a.txt", "1,prostate\n", "line 1 .* not of the form"),
+        ("a.txt", "", "names no label"),
+        ("a.txt", "1 a" + " " * 2**19 + "b", "line 1 .* not of the form"),
         ("a.txt", '1 255 0 0 1 1 1 "a"\n1 0 255 0 1 1 1 "b"\n', "twice"),
         ("a.txt", '70000 255 0 0 1 1 1 "a"\n', "from 0"),
         ("a.txt", '1 255 0 0 1 1 1 "a\x1b[2J"\n', "control characters"),
-        ("a.ctbl", "1 left hip 255 0 0 255\n", "does not look like"),
-        ("a.ctbl", "1 hip 255 0 0 255\n2 left hip 255 0 0 255\n", "line 2"),
+        ("a.ctbl", "1 left hip 255 0\n", "line 1 .* not of the form"),
+        ("a.ctbl", "1 hip 255 0 0 255\n2 left hip 255 x 0 255\n", "line 2"),
         ("a.csv", "a,b\n1,2\n", "lacks the columns"),
         ("a.csv", "LabelValue,Name\nx,bladder\n", "whole number"),
         ("a.csv", "LabelValue,Name\n1\n", "characters"),
@@ -114,7 +171,7 @@ def test_a_table_without_colours_or_with_impossible_ones_has_none(tmp_path: Path
         ("a.csv", "LabelValue,Name\n", "names no label"),
         ("a.tsv", "index\tlabel\n1\ta\n", "lacks the columns"),
         ("a.tsv", "index\tname\n-1\ta\n", "whole number"),
-        ("a.tsv", "index name\n1 a\n", "does not look like"),
+        ("a.tsv", "index name\n1 a\n", "lacks the columns"),
     ],
 )
 def test_a_bad_table_of_another_format_is_refused(tmp_path: Path, name: str, text: str, words: str) -> None:

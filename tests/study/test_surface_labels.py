@@ -9,6 +9,7 @@ import pytest
 
 from palpate.cli import main
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
+from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_label_image
 from palpate.images.readers.stl import FACET
 from palpate.study.surface_labels import surface_labels
@@ -89,19 +90,86 @@ def test_a_voxel_partly_inside_counts_by_its_centre(tmp_path):
 
 def test_what_is_no_closed_surface_is_refused(tmp_path):
     whole = box([0.0] * 3, [10.0] * 3)
+    turned = np.concatenate([whole[:5, ::-1], whole[5:]])
     wrong = {
-        "open": (stl(tmp_path / "open.stl", whole[1:]), "is not closed"),
+        "open": (stl(tmp_path / "open.stl", whole[1:]), "is not closed .11 triangles, 3 edges"),
         "none": (tmp_path / "none.stl", "cannot be read"),
         "cut": (stl(tmp_path / "cut.stl", whole), "is no STL"),
         "text": (stl(tmp_path / "text.stl", whole, text=True), "damaged text"),
         "nan": (stl(tmp_path / "nan.stl", np.where(whole == 10.0, np.nan, whole)), "no number of millimetres"),
         "empty": (stl(tmp_path / "empty.stl", whole[:0]), "is not closed"),
+        "turned": (stl(tmp_path / "turned.stl", turned), "beside 9 of 18 edges of .* face opposite ways"),
     }
     wrong["cut"][0].write_bytes(wrong["cut"][0].read_bytes()[:-7])
     wrong["text"][0].write_text(wrong["text"][0].read_text().replace("10.0", "ten", 1))
     for path, words in wrong.values():
         with pytest.raises(InputDataError, match=words):
             surface_labels([path])
+
+
+@pytest.mark.parametrize(
+    ("factor", "shift", "words"),
+    [
+        (1e-3, 0.0, "1000 times as large it would be 27 mL: where the file is in metres, write --scale 1000"),
+        (0.1, 0.0, "10 times as large it would be 27 mL: where the file is in centimetres, write --scale 10"),
+        (0.05, 0.0, "has 0 voxels: it holds 0.00337 mL"),
+        (1.0, 300.0, "has 0 voxels: .* are its unit and its axes right"),
+    ],
+)
+def test_an_organ_without_voxels_is_refused_with_what_to_write(tmp_path, factor, shift, words):
+    path = stl(tmp_path / "organ.stl", box([5.0 + shift] * 3, [35.0 + shift] * 3) * factor)
+    like = VoxelGrid((60, 60, 60), np.diag([2.0, 2.0, 2.0, 1.0]))
+    with pytest.raises(InputDataError, match=words):
+        surface_labels([path], like=like)
+    if factor < 1.0:
+        right = surface_labels([path], like=like, scale=1.0 / factor)
+        assert np.count_nonzero(right.image.labels) == 15**3
+        assert right.image.findings == ()
+
+
+def test_files_too_large_by_their_unit_are_refused_with_what_to_write(tmp_path):
+    with pytest.raises(ResourceError, match=r"0\.001 times as large it would be 27 mL.* write --scale 0\.001"):
+        surface_labels([stl(tmp_path / "organ.stl", box([5e3] * 3, [35e3] * 3))])
+
+
+def test_a_file_that_does_not_say_its_axes_beside_one_that_does_is_asked_for_them(tmp_path):
+    a, b = box([0.0] * 3, [10.0] * 3), box([12.0] * 3, [20.0] * 3)
+    paths = [stl(tmp_path / "a.stl", a * LPS, heading=b"SPACE=LPS"), stl(tmp_path / "b.stl", b * LPS, heading=b"")]
+    with pytest.raises(InputDataError, match=r"a\.stl' says SPACE=LPS, that of '.*b\.stl' does not.* --axes LPS"):
+        surface_labels(paths)
+    found = surface_labels(paths, axes="LPS").image
+    assert np.ptp(np.argwhere(found.labels), axis=0) == pytest.approx([19.0] * 3)
+
+
+@pytest.mark.parametrize(
+    ("pieces", "voxels", "codes"),
+    [
+        ([box([0.0] * 3, [10.0] * 3), box([20.0] * 3, [26.0] * 3)], 1216, ["islands"]),
+        ([box([0.0] * 3, [10.0] * 3), box([20.0] * 3, [26.0] * 3)[:, ::-1]], 1216, ["overlap", "islands"]),
+        ([box([0.0] * 3, [10.0] * 3), box([3.0] * 3, [7.0] * 3)[:, ::-1]], 936, ["islands"]),
+        ([box([0.0] * 3, [10.0] * 3), box([1.0] * 3, [12.0] * 3)], 1602, ["overlap", "islands"]),
+        ([box([0.0] * 3, [10.0] * 3)] * 2, 1000, ["overlap"]),
+        ([box([-40.0] * 3, [10.0] * 3)], 27000, ["cut-by-border"]),
+        ([box([0.0] * 3, [3.0] * 3)], 27, []),
+    ],
+)
+@pytest.mark.parametrize("text", [False, True])
+def test_pieces_of_a_surface_and_what_its_grid_cuts_are_told(tmp_path, pieces, voxels, codes, text):
+    path = stl(tmp_path / "organ.stl", np.concatenate(pieces), heading=b"solid organ")
+    path.write_bytes(path.read_bytes() + b"\0\0")  # what follows the last triangle is passed over
+    if text:  # each piece as a solid of its own
+        path.write_text("".join(stl(tmp_path / "piece", piece, text=True).read_text() for piece in pieces))
+    affine = np.diag([1.0, 1.0, 1.0, 1.0])
+    affine[:3, 3] = -19.5
+    found = surface_labels([path], like=VoxelGrid((60, 60, 60), affine)).image
+    assert np.count_nonzero(found.labels) == voxels
+    assert [finding.code for finding in found.findings] == codes
+
+
+def test_an_organ_that_another_one_takes_whole_is_refused(tmp_path):
+    twice = [stl(tmp_path / f"{name}.stl", box([0.0] * 3, [10.0] * 3)) for name in "ab"]
+    with pytest.raises(InputDataError, match="smaller organs claim all 1000 voxels of 'b'"):
+        surface_labels(twice)
 
 
 def test_a_text_too_large_to_be_taken_apart_is_refused_before_it_is(tmp_path):

@@ -78,6 +78,7 @@ def voxelise(arguments: argparse.Namespace, _: None, outputs: OutputFolder, prog
         spacing_mm=arguments.spacing,
         margin_mm=arguments.margin,
         axes=arguments.axes,
+        scale=arguments.scale,
         like=arguments.like,
         progress=progress,
     )

@@ -160,8 +160,10 @@ def _add_preparations(subparsers: Any) -> None:
     voxelise.add_argument("--spacing", type=_positive, default=1.0, metavar="MM", help=what)
     what = "how far the image reaches beyond the surfaces, mm; default: %(default)s"
     voxelise.add_argument("--margin", type=_positive, default=30.0, metavar="MM", help=what)
-    what = "of files that do not say; default: %(default)s"
-    voxelise.add_argument("--axes", choices=("RAS", "LPS"), default="RAS", help=what)
+    what = "of files that do not say; default: RAS"
+    voxelise.add_argument("--axes", choices=("RAS", "LPS"), help=what)
+    what = "millimetres of one unit of the files: 1000 where they are in metres; default: %(default)s"
+    voxelise.add_argument("--scale", type=_positive, default=1.0, metavar="MM", help=what)
     voxelise.add_argument("--like", type=Path, metavar="IMAGE", help="take this image's grid: the first state's")
     voxelise.set_defaults(targets=commands.SURFACE_TARGETS)
     mesh = _command(subparsers, "mesh", commands.mesh, what="make the tetrahedra of a case and write them")

@@ -10,6 +10,8 @@ import stat
 from pathlib import Path
 from typing import Any
 
+from palpate.errors import InputDataError
+
 CHUNK = 2**20  # bytes
 NO_WAIT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)  # a pipe that nobody writes to does not hold us
 FLAGS = os.O_RDONLY | NO_WAIT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
@@ -70,6 +72,20 @@ def open_input(path: Path) -> InputFile:
     except BaseException:
         os.close(descriptor)
         raise
+
+
+def whole_input(path: Path, limit: int) -> tuple[bytes, str]:
+    """All bytes of the file at `path`, and their SHA-256.
+
+    Raises `InputDataError` for a file that cannot be read or has more than `limit` bytes.
+    """
+    try:
+        content, digest = read_input(path, limit)
+    except (OSError, ValueError) as error:
+        raise InputDataError(f"'{path}' cannot be read ({error}); check the path") from error
+    if len(content) > limit:
+        raise InputDataError(f"'{path}' is larger than {limit} bytes; is it another file? Else make it smaller")
+    return content, digest
 
 
 def read_input(path: Path, limit: int) -> tuple[bytes, str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from palpate.errors import InputDataError
+from palpate.findings import Finding
 
 MAX_LABEL = 65535
 MAX_NAME = 200
@@ -27,12 +28,14 @@ class NamedLabel:
 class LabelTable(Mapping[int, str]):
     """A label table: itself the mapping label -> name; `colours`: label -> #rrggbb where the table has one.
 
-    `sha256`: digest (hexadecimal) of the file it was read from, empty when there is none.
+    `sha256`: digest (hexadecimal) of the file it was read from, empty when there is none. `findings`: what was left
+    out of it.
     """
 
     names: Mapping[int, str] = field(default_factory=dict)
     colours: Mapping[int, str] = field(default_factory=dict)
     sha256: str = ""
+    findings: tuple[Finding, ...] = ()
 
     def __getitem__(self, label: int) -> str:
         return self.names[label]
@@ -47,9 +50,10 @@ class LabelTable(Mapping[int, str]):
 def checked_table(rows: Iterable[NamedLabel], path: Path) -> LabelTable:
     """The rows of the file `path` as a table sorted by label.
 
-    Raises `InputDataError` for a label or name that is impossible or given twice.
+    Raises `InputDataError` for a label or name that is impossible or stands for two.
     """
     rows = [replace(row, name=row.name.strip()) for row in rows]
+    rows = list({(row.label, row.name): row for row in reversed(rows)}.values())  # those that agree are one
     for row in rows:
         if not 0 <= row.label <= MAX_LABEL or not 1 <= len(row.name) <= MAX_NAME:
             raise InputDataError(

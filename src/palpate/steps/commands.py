@@ -107,18 +107,22 @@ def voxelise(
     *surfaces: PathLike,
     spacing_mm: float = 1.0,
     margin_mm: float = 30.0,
-    axes: str = "RAS",
+    axes: str | None = None,
+    scale: float = 1.0,
     like: PathLike | None = None,
     progress: Progress = silent,
 ) -> SurfaceLabels:
     """The label image of closed surfaces (STL), one an organ, as `palpate voxelise` writes it.
 
     spacing_mm, margin_mm: of the grid that is made; like: an image whose grid is taken; axes: "RAS" or "LPS", of files
-    that do not say. Raises `InputDataError` for surfaces that cannot be read or are not closed.
+    that do not say; scale: mm of their unit. Raises `InputDataError` for surfaces that cannot be read, are not closed
+    or hold no voxel.
     """
     grid = None if like is None else read_label_image(Path(like)).grid
     paths = [Path(path) for path in surfaces]
-    return surface_labels(paths, spacing_mm=spacing_mm, margin_mm=margin_mm, axes=axes, like=grid, progress=progress)
+    return surface_labels(
+        paths, spacing_mm=spacing_mm, margin_mm=margin_mm, axes=axes, scale=scale, like=grid, progress=progress
+    )
 
 
 def estimate(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,10 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import ConfigurationError, ResourceError
-from palpate.findings import warning_rows
+from palpate.errors import ConfigurationError, InputDataError, ResourceError
+from palpate.findings import Finding, warning_rows
 from palpate.images import LabelImage, VoxelGrid
+from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.named_labels import NamedLabel
 from palpate.images.readers.merged_masks import Mask, merged
 from palpate.images.readers.stl import SurfaceFile, read_stl
@@ -23,6 +24,8 @@ MOST_VOXELS = 2**28
 MOST_SURFACES = 500
 AT_ONCE = 2**20  # voxels of a surface that are asked together
 HALF = 0.5  # a turn: nearer to one than to none
+LIKELY_MM3 = (100.0, 2e8)  # of what is segmented: a seed, a whole body
+DOUBTFUL = 0.2  # of the volume, more than voxels cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +52,8 @@ def surface_labels(
     *,
     spacing_mm: float = 1.0,
     margin_mm: float = 30.0,
-    axes: str = "RAS",
+    axes: str | None = None,
+    scale: float = 1.0,
     like: VoxelGrid | None = None,
     progress: Progress = silent,
 ) -> SurfaceLabels:
@@ -58,9 +62,10 @@ def surface_labels(
     A voxel is an organ's where the surface winds once round its centre: where its generalised winding number is nearer
     to 1, or -1, than to 0 (Jacobson, Kavan & Sorkine-Hornung, ACM Trans. Graph. 32 (2013) 33; libigl). One that several
     organs claim goes to the smallest of them. The grid reaches `margin_mm` beyond all surfaces, in voxels of
-    `spacing_mm`, or is the one that is given (`like`: that of the first state's image). axes: of files that do not say.
-    Raises `InputDataError` as `read_stl`, `ConfigurationError` for names that stand twice or too many,
-    `ResourceError` for a grid that is too large.
+    `spacing_mm`, or is the one that is given (`like`: that of the first state's image). axes: "RAS" or "LPS", of files
+    that do not say (None: RAS); scale: of the coordinates, 1000 for files in metres. Raises `InputDataError` as
+    `read_stl`, for an organ without a voxel, and where files say their axes and others do not,
+    `ConfigurationError` for names that stand twice or too many, `ResourceError` for a grid that is too large.
     """
     names = [file.stem for file in files]
     if len(set(names)) < len(names) or not 0 < len(files) <= MOST_SURFACES:
@@ -68,7 +73,16 @@ def surface_labels(
             f"{len(files)} surfaces are named, of {len(set(names))} names; give 1 to {MOST_SURFACES} files of different"
             " names, which are those of the organs"
         )
-    surfaces = [read_stl(file, axes=axes) for file in files]
+    surfaces = [read_stl(file) for file in files]
+    said = {surface.space: file for file, surface in zip(files, surfaces, strict=True)}
+    if axes is None and "" in said and len(said) > 1:
+        space = max(said)
+        raise InputDataError(
+            f"the heading of '{said[space]}' says SPACE={space}, that of '{said['']}' does not say its axes; write"
+            f" --axes {space} where one program wrote both, else --axes {'LPS' if space == 'RAS' else 'RAS'}"
+        )
+    signs = {"": LPS_TO_RAS if axes == "LPS" else 1.0, "RAS": 1.0, "LPS": LPS_TO_RAS}
+    surfaces = [replace(each, points=each.points * signs[each.space] * scale) for each in surfaces]
     grid = like
     if grid is None:  # cubes along RAS that hold all surfaces and the margin
         low = np.min([surface.points.min(axis=0) for surface in surfaces], axis=0) - margin_mm
@@ -80,25 +94,71 @@ def surface_labels(
     if (size := float(np.prod([float(n) for n in grid.shape]))) > MOST_VOXELS:
         raise ResourceError(
             f"the grid would have {size:.3g} voxels, over {MOST_VOXELS}; take larger ones, or less margin"
+            f"{next(filter(None, map(_other_unit, surfaces)), '')}"
         )
-    insides = dict[str, int]()
+    counts, findings = dict[str, int](), list[Finding]()
 
     def masks() -> Iterator[Mask]:
         for number, (name, surface) in enumerate(zip(names, surfaces, strict=True), start=1):
             progress(f"surface {number} of {len(surfaces)}: {name}")
             inside = _inside(surface, grid)
-            insides[name] = int(np.count_nonzero(inside))
+            counts[name] = int(np.count_nonzero(inside))
+            findings.extend(_flaws(name, surface, counts[name], grid))
             yield Mask(NamedLabel(number, name), inside)
 
-    labels, findings = merged(masks(), grid.shape)
+    labels, overlaps = merged(masks(), grid.shape)
+    left = np.bincount(labels.ravel(), minlength=len(names) + 1)
+    for number, name in enumerate(names, start=1):
+        if not left[number]:
+            raise InputDataError(
+                f"smaller organs claim all {counts[name]} voxels of '{name}'; is a surface named twice?"
+            )
     digests = {name: surface.digest for name, surface in zip(names, surfaces, strict=True)}
-    image = LabelImage(labels, grid, dict(enumerate(names, start=1)), {}, digests, findings)
-    volumes = dict[str, tuple[float, float]]()
-    for name, surface in zip(names, surfaces, strict=True):
-        a, b, c = np.moveaxis(surface.points[surface.triangles], 1, 0)
-        held = float(abs(np.einsum("ni,ni->n", a, np.cross(b, c)).sum()) / 6.0)
-        volumes[name] = (held, insides[name] * grid.voxel_volume)
-    return SurfaceLabels(image, volumes)
+    image = LabelImage(labels, grid, dict(enumerate(names, start=1)), {}, digests, (*findings, *overlaps))
+    held = zip(names, surfaces, strict=True)
+    return SurfaceLabels(image, {name: (of.held_mm3, counts[name] * grid.voxel_volume) for name, of in held})
+
+
+def _flaws(name: str, surface: SurfaceFile, count: int, grid: VoxelGrid) -> list[Finding]:
+    """What the `count` of its voxels tells of a surface; raises `InputDataError` where there is none."""
+    ends = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
+    held, counted = surface.held_mm3, count * grid.voxel_volume
+    volume = f"{held / 1000.0:.3g} mL"
+    advice = _other_unit(surface) or "; are its unit and its axes right (--scale, --axes)?"
+    if not count or np.ptp(ends, axis=0).max() < 2.0 * grid.spacing.max():
+        raise InputDataError(
+            f"'{name}' has {count} voxels: it holds {volume} from {ends[0].round(3).tolist()} to"
+            f" {ends[1].round(3).tolist()} mm (RAS), on a grid from {grid.affine[:3, 3].round(3).tolist()} to"
+            f" {grid.world(np.array(grid.shape) - 1.0).round(3).tolist()} mm in voxels of {grid.spacing.max():.3g} mm"
+            f"{advice}"
+        )
+    found = []
+    index = grid.index(surface.points)
+    beyond = bool(((index < -0.5) | (index > np.array(grid.shape) - 0.5)).any())
+    if beyond and counted < held:
+        text = f"the grid ends in '{name}': {1.0 - counted / held:.1%} of its {volume} lies beyond; take a larger image"
+        found.append(Finding("cut-by-border", text, name))
+    elif abs(counted - held) > DOUBTFUL * held:
+        text = (
+            f"the triangles of '{name}' hold {volume}, its voxels {counted / 1000.0:.3g} mL: pieces of it overlap, are"
+            " in the file twice, or are turned inside out; make one surface of them where it was made"
+        )
+        found.append(Finding("overlap", text, name))
+    pieces = int(igl.facet_components(surface.triangles)[0])
+    if pieces > 1:
+        text = f"'{name}' has {pieces} closed pieces, which were taken for one organ; give each organ a file of its own"
+        found.append(Finding("islands", text, name))
+    return found
+
+
+def _other_unit(surface: SurfaceFile) -> str:
+    """What is to be written where the surface holds as much as organs do in another unit, as the end of a sentence."""
+    for factor, unit in ((1000.0, "metres"), (10.0, "centimetres"), (0.001, "micrometres")):
+        volume = surface.held_mm3 * factor**3
+        if not LIKELY_MM3[0] < surface.held_mm3 < LIKELY_MM3[1] and LIKELY_MM3[0] < volume < LIKELY_MM3[1]:
+            times = f"{factor:g} times as large it would be {volume / 1000.0:.3g} mL"
+            return f"; {times}: where the file is in {unit}, write --scale {factor:g}"
+    return ""
 
 
 def _inside(surface: SurfaceFile, grid: VoxelGrid) -> NDArray[np.bool_]:

@@ -11,6 +11,7 @@ import numpy as np
 import pydicom
 import pytest
 from numpy.typing import NDArray
+from pydicom.dataset import Dataset
 
 from dicom_files import TILTED, axes_of, ct_slices, save_contours, save_segmentation, save_series, traced
 from palpate.errors import InputDataError, ResourceError
@@ -114,15 +115,27 @@ def test_contours_have_the_volumes_and_places_that_were_drawn(tmp_path: Path, le
     assert sorted(image.digests) == ["", "series"]
 
 
-def test_contours_of_sparser_or_finer_planes_fill_the_slices_nearest_to_them(tmp_path: Path) -> None:
+def test_contours_of_sparser_or_finer_planes_make_slices_which_are_named(tmp_path: Path) -> None:
+    """The ends reach half the planes' distance further: as many voxels as the slabs round the planes hold."""
     slices = series()
     save_series(tmp_path / "ct", slices)
     square = np.array([[0, 9.5, 9.5], [0, 9.5, 19.5], [0, 29.5, 19.5], [0, 29.5, 9.5]])
-    for planes, expected in (((2, 4, 6), 6), (np.arange(2, 6.1, 0.5), 5), ((2.5, 3.5), 2), ((4,), 1)):
+    cases = (
+        ((2, 4, 6), 6, "2 at S 21, 27 mm interpolated; its planes every 6 mm"),
+        (np.arange(2, 6.1, 0.5), 5, ""),
+        ((2.5, 3.5), 2, "1 at S 21 mm interpolated; its planes every 3 mm"),
+        ((4,), 1, ""),
+        ((2, 3, 5, 6), 5, "1 at S 24 mm interpolated"),
+        ((2, 3, 4, 9, 10), 5, "4 at S 27, 30, 33, 36 mm left empty"),
+    )
+    for planes, expected, words in cases:
         lines = [(np.add(square, [k, 0, 0]), "CLOSED_PLANAR") for k in planes]
         image = read_label_image(save_contours(tmp_path / "a.dcm", slices, NAMES, {1: lines}))
-        assert np.count_nonzero(image.labels) == expected * 200
-        assert [finding.code for finding in image.findings] == ["sparse-contours"] * (expected == 6)
+        layers = np.count_nonzero(image.labels, axis=(0, 1))
+        assert layers.sum() == expected * 200
+        assert np.average(np.arange(SHAPE[0]), weights=layers) == pytest.approx(np.mean(planes))
+        assert [finding.code for finding in image.findings] == ["sparse-contours"] * bool(words)
+        assert all(f"'prostate' ({words}" in finding.message for finding in image.findings)
 
 
 def test_contours_that_enclose_nothing_are_left_out_and_warned_of(tmp_path: Path) -> None:
@@ -130,11 +143,46 @@ def test_contours_that_enclose_nothing_are_left_out_and_warned_of(tmp_path: Path
     save_series(tmp_path, slices)
     square = np.array([[3, 9.5, 9.5], [3, 9.5, 19.5], [3, 29.5, 19.5], [3, 29.5, 9.5]])
     lines = [(square, "CLOSED_PLANAR"), (np.add(square, [1, 0, 0]), "OPEN_PLANAR"), (square[:2], "CLOSED_PLANAR")]
-    image = read_label_image(save_contours(tmp_path / "a.dcm", slices, NAMES, {1: [*lines, (square[:1], "POINT")]}))
+    lines += [(square[:1], "POINT"), (square[::-1], "CLOSED_PLANAR")]
+    below = [(np.add(square, [-9, 0, 0]), "CLOSED_PLANAR")]
+    image = read_label_image(save_contours(tmp_path / "a.dcm", slices, NAMES, {1: lines, 2: [], 3: below}))
     assert np.count_nonzero(image.labels) == 200
     (finding,) = image.findings
     assert finding.code == "open-contours"
-    assert "'prostate' (1 open and 2 of under 3 points)" in finding.message
+    assert "'prostate' (1 open and 2 of under 3 points and 1 in the file twice)" in finding.message
+    assert "'Blase ü' (none on this series)" in finding.message
+    assert "'tumour' (100.0% of its points beyond the series and no voxel)" in finding.message
+
+
+def test_names_that_stand_twice_series_without_uid_and_structures_of_another_series(tmp_path: Path) -> None:
+    slices, other = series(), series("sagittal")
+    for number, each in enumerate((slices, other)):
+        save_series(tmp_path / f"ct{number}", each)
+    lines = {n: traced(mask, 0.5) for n, mask in masks().items()}
+    twice = NAMES | {2: NAMES[1]}
+    ds = pydicom.dcmread(save_contours(tmp_path / "a.dcm", slices, twice, lines))
+    frames = [Dataset(), ds.ReferencedFrameOfReferenceSequence[0]]  # that of the other series stands first, without it
+    for roi, frame in zip(ds.StructureSetROISequence, "BBA", strict=True):
+        roi.ReferencedFrameOfReferenceUID = f"1.{ord(frame)}"
+    frames[0].FrameOfReferenceUID, frames[1].FrameOfReferenceUID = "1.65", "1.66"
+    ds.ReferencedFrameOfReferenceSequence = frames
+    ds.save_as(tmp_path / "a.dcm")
+    image = read_label_image(tmp_path / "a.dcm")
+    assert image.names == {1: "prostate (ROI 1)", 2: "prostate (ROI 2)", 3: "tumour"}
+    assert np.count_nonzero(image.labels == 1) == np.count_nonzero(masks()[1])
+    frames[0].RTReferencedStudySequence = [Dataset()]
+    frames[0].RTReferencedStudySequence[0].RTReferencedSeriesSequence = [Dataset()]
+    frames[0].RTReferencedStudySequence[0].RTReferencedSeriesSequence[0].SeriesInstanceUID = "1.2"
+    ds.save_as(tmp_path / "a.dcm")
+    image = read_label_image(tmp_path / "a.dcm")
+    assert sorted(image.names) == [1, 2]
+    assert "'tumour' (none on this series)" in image.findings[0].message
+    del ds.ReferencedFrameOfReferenceSequence
+    drawn = Dataset()
+    drawn.ReferencedSOPInstanceUID = slices[3].SOPInstanceUID
+    ds.ROIContourSequence[0].ContourSequence[0].ContourImageSequence = [drawn]
+    ds.save_as(tmp_path / "a.dcm")
+    assert np.array_equal(read_label_image(tmp_path / "a.dcm").labels == 1, image.labels == 1)
 
 
 def test_contours_without_their_slices_or_across_them_are_refused(tmp_path: Path) -> None:

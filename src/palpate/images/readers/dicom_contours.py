@@ -1,13 +1,12 @@
 """RTSTRUCT: planar contours made a label image on the grid of the series that they were drawn on.
 
-A voxel belongs to a structure when its centre is inside an odd number of the contours in its slice (holes by exclusive
-or), or on one of them: programs that trace masks put contours through the centres of the outermost voxels.
 Attributes: DICOM PS3.3, C.8.8.5 and C.8.8.6.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,37 +15,33 @@ from numpy.typing import NDArray
 from pydicom.dataset import Dataset
 
 from palpate.errors import InputDataError
-from palpate.findings import Finding
+from palpate.findings import Code, Finding
 from palpate.images.label_image import LPS_TO_RAS, VoxelGrid
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, hex_colour, printable
 from palpate.images.readers.dicom_dataset import Series, read_dataset, sentences, series_beside
 from palpate.images.readers.merged_masks import Mask, merged
+from palpate.images.readers.planar_contours import Contour, body, distinct
 from palpate.images.readers.registry import StoredImage
 
-CLOSED = ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
-ON_EDGE = 0.01  # of a voxel: contours are written with some six digits
+EXCLUSIVE = "CLOSEDPLANAR_XOR"
+CLOSED = ("CLOSED_PLANAR", EXCLUSIVE)
 MOST_TRIED = 20  # contours of a structure, to see how slices lie
-SPARSE = 1.5  # slices between planes
+MOST_SHOWN = 8  # structures, or slices of one, in a sentence
 ONE_PLANE = 0.1  # of the distance of slices, between points of one contour, and contours of one plane
 
 
 @dataclass(frozen=True, slots=True)
 class _Structure:
-    """A structure's row, its closed contours by planes, and how many others it has.
+    """A structure's row, its closed contours by planes at ascending `heights` (n_planes,) in slices.
 
-    `heights` (n_planes,) in slices, ascending; `areas`: of each plane, contours (n, 2) of row and column.
+    flaws: what was left out or is cut, in words.
     """
 
     row: NamedLabel
     heights: NDArray[np.float64]
-    areas: tuple[tuple[NDArray[np.float64], ...], ...]
-    n_open: int
-    n_short: int
-
-    @property
-    def apart(self) -> float:
-        """Distance of the planes, in slices."""
-        return float(np.median(np.diff(self.heights))) if len(self.heights) > 1 else 1.0
+    planes: tuple[list[Contour], ...]
+    exclusive: bool
+    flaws: tuple[str, ...]
 
 
 def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
@@ -56,34 +51,40 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
     """
     with sentences(path):
         dataset, sha256 = read_dataset(path)
-        uids = (
-            str(series.SeriesInstanceUID)
+        drawn: dict[int, list[Dataset]] = {int(roi.ROINumber): [] for roi in dataset.StructureSetROISequence}
+        for item in dataset.ROIContourSequence:
+            drawn.setdefault(int(item.ReferencedROINumber), []).extend(item.get("ContourSequence") or ())
+        tried = [contour for contours in drawn.values() for contour in contours[:MOST_TRIED]]
+        frames = {
+            str(series.SeriesInstanceUID): str(frame.get("FrameOfReferenceUID"))
             for frame in dataset.get("ReferencedFrameOfReferenceSequence", ())
             for study in frame.get("RTReferencedStudySequence", ())
             for series in study.get("RTReferencedSeriesSequence", ())
-        )
-        series = series_beside(path, next(uids, "")) or (Series(grid) if grid else None)
+        }
+        slices = [str(of.ReferencedSOPInstanceUID) for each in tried for of in each.get("ContourImageSequence", ())]
+        series = series_beside(path, [*frames] or slices) or (Series(grid) if grid else None)
         if series is None:
             raise InputDataError(
                 f"the DICOM series that '{path}' was drawn on is not beside it, and without its slices contours have no"
                 " voxels; copy it into the folder of that file, or into one there, or name a grey image on its grid as"
                 " intensities_before or intensities_after of the case"
             )
-        # the slices lie across the axis along which the first contours run least
-        extent = np.zeros(3)
-        for item in dataset.ROIContourSequence:
-            for contour in (item.get("ContourSequence") or ())[:MOST_TRIED]:
-                extent += np.ptp(series.grid.index(_points(contour)), axis=0)
+        # the slices lie across the axis along which the contours run least
+        extent = sum((np.ptp(series.grid.index(_points(contour)), axis=0) for contour in tried), np.zeros(3))
         axis = int(np.argmin(extent))
-        rows, columns = (n for k, n in enumerate(series.grid.shape) if k != axis)
-        shape = (series.grid.shape[axis], rows, columns)
-        # RAS mm -> index, the axis of the slices first
-        inverse = np.asarray(np.linalg.inv(series.grid.affine), dtype=np.float64)
-        structures = _structures(dataset, inverse[[axis, *(k for k in range(3) if k != axis), 3]], path)
-        findings = _flaws(structures)
-        masks = (Mask(each.row, _filled(each, shape)) for each in structures)
-        labels, overlaps = merged(masks, shape)
-    named = tuple(each.row for each in structures)
+        away = set(frames.values()) - {frames.get(series.uid, "")} if series.uid else set[str]()
+        structures = [
+            _structure(row, [] if frame in away else contours, series.grid, axis, path)
+            for row, frame, contours in _rows(dataset, drawn)
+        ]
+        if not any(each.planes for each in structures):
+            raise InputDataError(f"'{path}' has no structure with a contour that encloses something; export it again")
+        shape = tuple(series.grid.shape[k] for k in (axis, *(k for k in range(3) if k != axis)))
+        findings = list[Finding]()
+        labels, overlaps = merged(
+            _masks(structures, (shape[0], shape[1], shape[2]), series.grid, axis, findings), shape
+        )
+    named = tuple(each.row for each in structures if each.planes)
     digests = {"": sha256, **({"series": series.sha256} if series.sha256 else {})}
     return StoredImage(np.moveaxis(labels, 0, axis), series.grid.affine, named, digests, (*findings, *overlaps))
 
@@ -93,114 +94,81 @@ def _points(contour: Dataset) -> NDArray[np.float64]:
     return np.asarray(np.array(contour.ContourData, dtype=np.float64).reshape(-1, 3) * LPS_TO_RAS)
 
 
-def _structures(dataset: Dataset, to_index: NDArray[np.float64], path: Path) -> list[_Structure]:
-    """Those that have contours; numbered as in the file where its numbers can be labels, else from 1."""
-    names = {int(roi.ROINumber): str(roi.get("ROIName", "")) for roi in dataset.StructureSetROISequence}
-    drawn = [item for item in dataset.ROIContourSequence if item.get("ContourSequence")]
-    numbers = [int(item.ReferencedROINumber) for item in drawn]
-    if not numbers:
-        raise InputDataError(f"'{path}' has no structure with a contour; export the structures again")
-    usable = len(set(numbers)) == len(numbers) and 1 <= min(numbers) <= max(numbers) <= MAX_LABEL
-    structures = []
-    for place, (item, number) in enumerate(zip(drawn, numbers, strict=True), start=1):
-        label = number if usable else place
-        name = printable(names.get(number, "").strip())[:MAX_NAME] or f"structure {label}"
-        colour = None
-        if len(item.get("ROIDisplayColor") or ()) == 3:
-            red, green, blue = (float(part) for part in item.ROIDisplayColor)
-            colour = hex_colour(red, green, blue, top=255)
-        contours, heights, areas = list[NDArray[np.float64]](), list[float](), list[list[NDArray[np.float64]]]()
-        n_open = n_short = 0
-        for contour in item.ContourSequence:
-            points = _points(contour)
-            if len(points) < 3:
-                n_short += 1
-            elif contour.get("ContourGeometricType") not in CLOSED:
-                n_open += 1
-            else:
-                contours.append(points @ to_index[:3, :3].T + to_index[:3, 3])
-        for points in sorted(contours, key=lambda points: float(points[:, 0].mean())):
-            height, spread = float(points[:, 0].mean()), float(np.ptp(points[:, 0]))
-            if not spread <= ONE_PLANE:
-                raise InputDataError(
-                    f"a contour of '{name}' in '{path}' runs over {spread:.3g} slices of its series, not one;"
-                    " export the structures on the slices that they were drawn on"
-                )
-            if not heights or height - heights[-1] > ONE_PLANE:
-                heights.append(height)
-                areas.append([])
-            areas[-1].append(points[:, 1:])
-        row, planes = NamedLabel(label, name, colour), tuple(map(tuple, areas))
-        structures.append(_Structure(row, np.array(heights), planes, n_open, n_short))
-    return structures
+def _rows(dataset: Dataset, drawn: Mapping[int, list[Dataset]]) -> Iterator[tuple[NamedLabel, str, list[Dataset]]]:
+    """Row, frame of reference and contours of each; numbered as in the file where that can be labels, else from 1."""
+    rois = {int(roi.ROINumber): roi for roi in dataset.StructureSetROISequence}
+    colours = {int(item.ReferencedROINumber): item.get("ROIDisplayColor") or () for item in dataset.ROIContourSequence}
+    names = {number: printable(str(roi.get("ROIName", "")).strip())[: MAX_NAME - 20] for number, roi in rois.items()}
+    often = Counter(names.get(number) for number, contours in drawn.items() if contours)
+    usable = 1 <= min(drawn, default=0) <= max(drawn, default=0) <= MAX_LABEL
+    for place, (number, contours) in enumerate(drawn.items(), start=1):
+        name = names.get(number) or f"structure {number}"
+        name = f"{name} (ROI {number})" if often[name] > 1 else name
+        rgb = [float(part) for part in colours.get(number, ())]
+        colour = hex_colour(*rgb, top=255) if len(rgb) == 3 else None
+        frame = str(rois.get(number, Dataset()).get("ReferencedFrameOfReferenceUID"))
+        yield NamedLabel(number if usable else place, name, colour), frame, contours
 
 
-def _flaws(structures: Sequence[_Structure]) -> tuple[Finding, ...]:
-    """What was left out, and what was filled in."""
-    found: list[Finding] = []
-    lines = [
-        f"'{each.row.name}' ({' and '.join(parts)})"
-        for each in structures
-        if (parts := [f"{n} {kind}" for n, kind in ((each.n_open, "open"), (each.n_short, "of under 3 points")) if n])
-    ]
-    if lines:
-        text = f"contours that enclose nothing were left out: {', '.join(lines)}; close them, or draw them again"
-        found.append(Finding("open-contours", text))
-    sparse = [f"'{each.row.name}' ({each.apart:.3g} slices)" for each in structures if each.apart > SPARSE]
-    if sparse:
-        text = (
-            f"contours are more than a slice apart: {', '.join(sparse)}; slices between them took those of the nearest"
-            " plane, so that surfaces have steps: interpolate the contours"
-        )
-        found.append(Finding("sparse-contours", text))
-    return tuple(found)
+def _structure(row: NamedLabel, contours: list[Dataset], grid: VoxelGrid, axis: int, path: Path) -> _Structure:
+    order = [axis, *(k for k in range(3) if k != axis)]
+    several = [(of.get("ContourGeometricType"), grid.index(_points(of))[:, order]) for of in contours]
+    closed = [points for kind, points in several if len(points) >= 3 and kind in CLOSED]
+    heights, planes = list[float](), list[list[Contour]]()
+    for points in sorted(closed, key=lambda points: float(points[:, 0].mean())):
+        height, spread = float(points[:, 0].mean()), float(np.ptp(points[:, 0]))
+        if not spread <= ONE_PLANE:
+            raise InputDataError(
+                f"a contour of '{row.name}' in '{path}' runs over {spread:.3g} slices of its series, not one;"
+                " export the structures on the slices that they were drawn on"
+            )
+        if not heights or height - heights[-1] > ONE_PLANE:
+            heights.append(height)
+            planes.append([])
+        planes[-1].append(points[:, 1:])
+    once = tuple(map(distinct, planes))
+    n_short = sum(len(points) < 3 for _, points in several)
+    border = np.array(grid.shape)[order] - 0.5 + ONE_PLANE
+    beyond = [np.any((points < -0.5 - ONE_PLANE) | (points > border), axis=1) for points in closed]
+    counts = {
+        "open": len(several) - n_short - len(closed),
+        "of under 3 points": n_short,
+        "in the file twice": len(closed) - sum(map(len, once)),
+    }
+    flaws = [f"{n} {kind}" for kind, n in counts.items() if n]
+    if share := float(np.mean(np.concatenate(beyond))) if beyond else 0.0:
+        flaws.append(f"{share:.1%} of its points beyond the series")
+    exclusive = any(kind == EXCLUSIVE for kind, _ in several)
+    return _Structure(row, np.array(heights), once, exclusive, tuple(flaws if several else ["none on this series"]))
 
 
-def _filled(structure: _Structure, shape: tuple[int, int, int]) -> NDArray[np.bool_]:
-    """The voxels inside; a slice takes the contours of the plane nearest to it, within half the planes' distance."""
-    inside = np.zeros(shape, dtype=bool)
-    half = max(0.5, 0.5 * structure.apart)
-    for k in range(shape[0] if len(structure.heights) else 0):
-        nearest = int(np.argmin(np.abs(structure.heights - k)))
-        if -half < k - structure.heights[nearest] <= half:
-            inside[k] = _area(structure.areas[nearest], shape[1:])
-    return inside
+def _masks(
+    structures: list[_Structure], shape: tuple[int, int, int], grid: VoxelGrid, axis: int, findings: list[Finding]
+) -> Iterator[Mask]:
+    """The voxels of each structure in turn; after the last, `findings` tell what was left out or filled."""
+    left_out, changed = list[str](), list[str]()
+    middle = 0.5 * (np.array(grid.shape) - 1.0)
 
+    def places(slices: list[int]) -> str:
+        index = np.where(np.arange(3) == axis, np.array(slices)[:, None], middle)
+        heights = ", ".join(f"{mm:.4g}" for mm in grid.world(index[:MOST_SHOWN])[:, axis])
+        return f"{len(slices)} at {'RAS'[axis]} {heights}{', ...' * (len(slices) > MOST_SHOWN)} mm"
 
-def _area(polygons: Sequence[NDArray[np.float64]], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Pixels (n_rows, n_columns) with centres inside an odd number of polygons (n, 2) of row and column, or on one.
-
-    Every row is cut by every edge; from a crossing on, all pixels to the right change sides.
-    """
-    starts = np.concatenate(polygons)
-    ends = np.concatenate([np.roll(polygon, -1, axis=0) for polygon in polygons])
-    crossings = np.zeros((shape[0], shape[1] + 1), dtype=np.int64)
-    on = np.zeros(shape, dtype=bool)
-    row, column = _cuts(starts, ends, shape[0], margin=0.0)
-    np.add.at(crossings, (row, np.clip(np.ceil(column), 0, shape[1]).astype(np.int64)), 1)
-    row, column = _cuts(starts, ends, shape[0], margin=ON_EDGE)
-    whole = np.rint(column)
-    near = (np.abs(column - whole) <= ON_EDGE) & (whole >= 0) & (whole < shape[1])
-    on[row[near], whole[near].astype(np.int64)] = True
-    level = np.rint(starts[:, 0])
-    along = (np.abs(starts[:, 0] - level) <= ON_EDGE) & (np.abs(ends[:, 0] - level) <= ON_EDGE)
-    for edge in np.flatnonzero(along & (level >= 0) & (level < shape[0])):  # edges that run along a row
-        low, high = np.sort([starts[edge, 1], ends[edge, 1]])
-        inside = slice(max(int(np.ceil(low - ON_EDGE)), 0), max(int(np.floor(high + ON_EDGE)) + 1, 0))
-        on[int(level[edge]), inside] = True
-    return np.asarray((np.cumsum(crossings, axis=1)[:, :-1] % 2 == 1) | on)
-
-
-def _cuts(
-    starts: NDArray[np.float64], ends: NDArray[np.float64], n_rows: int, *, margin: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Rows that edges cross, and the column of each crossing; with a margin also those that an edge ends on."""
-    low, high = np.minimum(starts[:, 0], ends[:, 0]), np.maximum(starts[:, 0], ends[:, 0])
-    sloped = high > low
-    first = np.clip(np.ceil(low - margin), 0, n_rows)
-    last = np.clip(np.ceil(high) if margin == 0.0 else np.floor(high + margin) + 1, 0, n_rows)
-    count = np.where(sloped, np.maximum(last - first, 0), 0).astype(np.int64)
-    edge = np.repeat(np.arange(len(count)), count)
-    row = (first[edge] + np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)).astype(np.int64)
-    share = np.clip((row - starts[edge, 0]) / (ends[edge, 0] - starts[edge, 0]), 0.0, 1.0)
-    return row, starts[edge, 1] + share * (ends[edge, 1] - starts[edge, 1])
+    for each in structures:
+        flaws = list(each.flaws)
+        if each.planes:
+            inside, noted = body(each.heights, each.planes, shape, exclusive=each.exclusive)
+            flaws += [] if inside.any() else ["no voxel"]
+            words = [f"{places(slices)} {kind}" for kind, slices in noted.items() if slices]
+            apart = sorted({round(float(step), 2) for step in np.diff(each.heights) * grid.spacing[axis]})
+            every = " to ".join(f"{mm:.3g}" for mm in apart[:: max(len(apart) - 1, 1)])
+            changed += [f"'{each.row.name}' ({'; '.join(words)}; its planes every {every} mm)"] if words else []
+            yield Mask(each.row, inside)
+        left_out += [f"'{each.row.name}' ({' and '.join(flaws)})"] if flaws else []
+    said: tuple[tuple[Code, str, list[str]], ...] = (
+        ("open-contours", "contours were left out, or are cut with the series", left_out),
+        ("sparse-contours", f"slices every {grid.spacing[axis]:.3g} mm are not as contours were drawn", changed),
+    )
+    for code, text, parts in said:
+        shown = f"{', '.join(parts[:MOST_SHOWN])}{', ...' * (len(parts) > MOST_SHOWN)}"
+        findings += [Finding(code, f"{text}: {shown}; look at them, or draw them")] if parts else []

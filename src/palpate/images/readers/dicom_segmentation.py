@@ -64,9 +64,8 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
             masks = (Mask(row, np.asarray(of.array)[..., 0] > 0) for row, of in zip(rows, volumes, strict=True))
             labels, findings = merged(masks, tuple(geometry.spatial_shape))
         affine = LPS_AFFINE @ geometry.affine
-        referenced = dataset.get("ReferencedSeriesSequence") or ()
-        series = series_beside(path, str(referenced[0].SeriesInstanceUID)) if referenced else None
-        series = series or (Series(grid) if grid else None)
+        referenced = [str(of.SeriesInstanceUID) for of in dataset.get("ReferencedSeriesSequence") or ()]
+        series = series_beside(path, referenced) or (Series(grid) if grid else None)
         return _completed(StoredImage(labels, affine, tuple(rows), {"": sha256}, findings), series)
 
 

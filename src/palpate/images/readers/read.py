@@ -39,7 +39,8 @@ def read_label_image(
     stored, own_grid = _read(path, "labels", limits, grid)
     own = checked_table(stored.names, path)
     table = own or (names if isinstance(names, LabelTable) else LabelTable(names or {}))
-    return LabelImage(stored.values, own_grid, table.names, table.colours, stored.digests, stored.findings)
+    findings = (*stored.findings, *table.findings)
+    return LabelImage(stored.values, own_grid, table.names, table.colours, stored.digests, findings)
 
 
 def read_intensities(
