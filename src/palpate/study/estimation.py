@@ -126,14 +126,20 @@ def conclude(
 
 
 def _reason(inversion: Inversion) -> str:
-    """How the estimate ended, and what became of the starts."""
-    converged = sum(start.minimum.converged for start in inversion.starts)
-    distinct = {s.candidate for s in inversion.starts if s.minimum.converged}
+    """How the estimate ended, and what became of the starts.
+
+    These are followed alone on the cheapest model: all of them may end, and the estimate that goes on from there not.
+    """
+    ended = [start.candidate for start in inversion.starts if start.minimum.converged]
+    distinct = len({candidate for candidate in ended if candidate is not None})
+    minima = f"{distinct} distinct {'minimum' if distinct == 1 else 'minima'}"
+    starts = f"{inversion.minimum.outcome.value}; {len(ended)} of {len(inversion.starts)} starts"
+    if not inversion.minimum.converged:
+        return f"{starts} led to {minima} of the model that they share, from where the estimate went on and did not end"
     outcomes = [candidate.minimum.outcome for candidate in inversion.candidates]
     lost, left = outcomes.count(Outcome.NO_EQUILIBRIUM), outcomes.count(Outcome.NOT_FOLLOWED)
     return (
-        f"{inversion.minimum.outcome.value}; {converged} of {len(inversion.starts)} starts converged,"
-        f" to {len(distinct)} distinct {'minimum' if len(distinct) == 1 else 'minima'}"
+        f"{starts} converged, to {minima}"
         + (f", {lost} of which {'has' if lost == 1 else 'have'} no equilibrium under the law" if lost else "")
         + (f", {left} of which could not be followed under the law" if left else "")
     )
