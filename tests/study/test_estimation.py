@@ -164,9 +164,7 @@ def test_what_did_not_converge_says_so(inversion, settings, observed):
     }
 
 
-def test_an_estimate_that_did_not_end_is_not_said_to_have_converged_where_its_starts_did(
-    inversion, settings, observed
-):
+def test_an_estimate_that_did_not_end_is_not_said_to_have_converged_where_its_starts_did(inversion, settings, observed):
     ended = with_candidate(inversion, minimum=replace(inversion.minimum, outcome=Outcome.STUCK))
     result = stated(ended, settings, observed)
     assert result.status == "not converged"

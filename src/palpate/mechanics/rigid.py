@@ -29,9 +29,7 @@ def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack(translations + rotations, axis=1)
 
 
-def refuse_floating(
-    space: LagrangeSpace, free: sparse.csr_matrix[np.float64], holdable: NDArray[np.bool_]
-) -> None:
+def refuse_floating(space: LagrangeSpace, free: sparse.csr_matrix[np.float64], holdable: NDArray[np.bool_]) -> None:
     """Raise `GeometryError` when a connected part of the mesh can move rigidly within `free` (n_dof, n_free).
 
     holdable (n_points,): on the image's cut, where another `outer_boundary` would hold them.

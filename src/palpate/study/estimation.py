@@ -23,6 +23,7 @@ from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, di
 from palpate.study.estimate_findings import data_findings, fold_findings, inversion_findings, pair_findings
 from palpate.study.estimated import Estimation, ForceFit, Iteration, PointFit, Start, TissueFit
 from palpate.study.map_words import map_findings
+from palpate.study.misfit import beside_misfits, misfits_of
 from palpate.study.poisson_ratios import NOT_IDENTIFIED
 from palpate.study.samples import CHAINS, draw_moduli, sample_findings
 from palpate.study.stated_posterior import stated_posteriors
@@ -72,7 +73,10 @@ def conclude(
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors)
     known = intervals_of(inversion, settings, posteriors)
-    estimates = estimates_of(inversion, known, covariance, truth=truth)
+    fits, forces, points = _seen(inversion, observed)
+    misfits = misfits_of(minimum.evaluation.linearisations, points, observed.states[0].space.mesh.tissues)
+    told = misfits if minimum.converged else ()
+    estimates = beside_misfits(estimates_of(inversion, known, covariance, truth=truth), told)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
     stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
     pairs = pairs and pairs.with_intervals_of(stating)
@@ -88,12 +92,12 @@ def conclude(
     if minimum.converged:  # of each kind of data in what is known of a tissue's modulus
         of_tissues = information_shares(minimum.evaluation, objective.n_parameters)
         shares = dict(zip(objective.parameters.tissues, of_tissues, strict=False))
-    fits, forces, points = _seen(inversion, observed)
     findings = (
         *inversion_findings(inversion, covariance.total),
         *pair_findings(pairs),
         *fold_findings(observed.states),
         *data_findings(inversion),
+        *(misfit.finding for misfit in misfits),
         *sample_findings(drawn),
         *discrepancy_findings(found_discrepancy),
         *map_findings(maps),
@@ -102,7 +106,7 @@ def conclude(
         status="converged" if minimum.converged else "not converged",
         reason=_reason(inversion),
         estimates=estimates,
-        poisson_ratios=ratios_of(inversion, known, covariance),
+        poisson_ratios=beside_misfits(ratios_of(inversion, known, covariance), told),
         covariance=covariance,
         starts=tuple(_start(inversion, start) for start in inversion.starts),
         fits=fits,
