@@ -29,13 +29,17 @@ ALONG = 0.9  # cosine to an axis, from which on a direction is told as that axis
 
 @dataclass(frozen=True, slots=True)
 class Misfit:
-    """One kind of data that is missed, by `times` what its noise explains, in words of a verdict and of a finding."""
+    """One kind of data that is missed, by `times` what its noise explains, in words of a verdict and of a finding.
+
+    whole: the data as a whole, and not some points, which a robust loss leaves little weight.
+    """
 
     about: str
     state: int
     times: float
     short: str
     text: str
+    whole: bool = True
 
     @property
     def finding(self) -> Finding:
@@ -46,7 +50,7 @@ class Misfit:
 def misfits_of(
     lines: Sequence[Linearisation], points: Sequence[PointFit], tissues: Sequence[Tissue]
 ) -> tuple[Misfit, ...]:
-    """Those of all data of a fit, the worst one first; points: measured and fitted motions, in the order of `lines`.
+    """Those of all data of a fit; points: measured and fitted motions, in the order of `lines`.
 
     Of the surfaces those of `tissues` that are meshed: the modes of a driver follow its wall, and a hollow tissue is
     seen where no mesh is beside it, too, so that parts of it in the image belong to nothing.
@@ -60,15 +64,25 @@ def misfits_of(
             found.append(_of_instrument(line, line.observation))
         elif isinstance(line.observation, Imaged) and line.observation.tissue in meshed:
             found.append(_of_surface(line, line.observation))
-    return tuple(sorted(filter(None, found), key=lambda misfit: -misfit.times))
+    return tuple(filter(None, found))
 
 
 def beside_misfits(estimates: Sequence[T], misfits: Sequence[Misfit]) -> tuple[T, ...]:
-    """Estimates whose reasons tell of the worst misfit, if there is one: no interval covers what a model lacks."""
+    """Estimates whose reasons tell of the worst misfit, if there is one.
+
+    No interval covers what a model lacks: beside data that are missed as a whole no estimate is `identified`.
+    """
     if not misfits:
         return tuple(estimates)
-    words = f"but the model misses {misfits[0].short} (warning `data-misfit`)"
-    return tuple(replace(estimate, why=f"{estimate.why}, {words}") for estimate in estimates)
+    worst = max(misfits, key=lambda misfit: (misfit.whole, misfit.times))
+    words = f"but the model misses {worst.short} (warning `data-misfit`)"
+
+    def told(estimate: T) -> T:
+        """The same with the reason, and the verdict that is left."""
+        word = "weak" if worst.whole and estimate.verdict == "identified" else estimate.verdict
+        return replace(estimate, verdict=word, why=f"{estimate.why}, {words}")
+
+    return tuple(map(told, estimates))
 
 
 def _of_points(line: Linearisation, motions: PointMotions) -> Misfit | None:
@@ -96,7 +110,7 @@ def _of_points(line: Linearisation, motions: PointMotions) -> Misfit | None:
             f" of all {which}: by {by:.2g} mm, {times:.2g} times what that explains. Are they the same points"
             " in both states, or of a part that moves otherwise? Correct them, or take them out"
         )
-        return Misfit(name, line.state, times, short, text)
+        return Misfit(name, line.state, times, short, text, whole=False)
     along = left.T @ (scaled @ direction)  # in space, whatever the errors' covariance makes of it
     along *= np.sign(along[np.abs(along).argmax()]) / np.linalg.norm(along)
     words = "".join(axis for axis, cosine in zip(AXES, along, strict=True) if cosine > ALONG)
@@ -118,17 +132,17 @@ def _of_surface(line: Linearisation, seen: Imaged) -> Misfit | None:
     noise = "that is stated"
     if seen.stated_noise is None:
         sd, noise = max(sd, observation.weighting.sd), "that the image shows"
-    shares, size, n = of.weights / of.weights.sum(), np.abs(of.values), observation.weighting.count
-    far = RELEVANT * float(np.sqrt(chi2.isf(TAIL, 1))) * sd
-    share, rms = float(shares[size > far].sum()), float(np.sqrt(shares @ size**2))
-    times = rms / sd
-    if not (times > _limit(n, 1.0) or _is_tail(share, n, off=1)):
+    shares, fit, n = of.weights / of.weights.sum(), observation.fit(of), observation.weighting.count
+    usual = float(np.sqrt(chi2.isf(TAIL, 1))) * sd
+    far = float(shares[np.abs(of.values) > RELEVANT * usual].sum())
+    if not (fit.rms_mm / sd > _limit(n, 1.0) or _is_tail(far, n, off=1)):
         return None
-    what = f"the surface of '{name}' in state {line.state + 1}"
+    times, what = max(fit.rms_mm / sd, fit.hd95_mm / usual), f"the surface of '{name}' in state {line.state + 1}"
     text = (
-        f"the fitted model misses {what} by {rms:.2g} mm (root mean square), {times:.2g} times the noise of {sd:.2g} mm"
-        f" {noise}; {share:.0%} of it by more than {far:.2g} mm. Look at it in the report: is it drawn otherwise there,"
-        " or moved by what the model lacks (law, boundary, a part that slides)?"
+        f"the fitted model misses {what} by {fit.rms_mm:.2g} mm (root mean square) and {TAIL:.0%} of it by"
+        f" {fit.hd95_mm:.2g} mm or more, {times:.2g} times what the noise of {sd:.2g} mm {noise} explains. Look at it"
+        " in the report: is it drawn otherwise there? Or does the model lack what moves it: another law or boundary, a"
+        " part that slides?"
     )
     return Misfit(name, line.state, times, f"{what} by {times:.2g} times its noise", text)
 
