@@ -129,6 +129,17 @@ def test_what_is_missed_along_one_direction_is_named_with_it(measured, shape, di
     assert stated in misfit.text
 
 
+def test_what_is_missed_smoothly_is_no_part_of_errors_that_are_alike(measured):
+    """Of 200 residuals it is a few, and hardly tells in their mean square; beside the error of a point it does."""
+    points = measured(200, correlation_mm=8.0)
+    errors = correlated(points.places, 8.0) @ points.noise(1)
+    errors[:, 0] += 3.5 * SD
+    (misfit,) = points.misfits(errors)
+    assert misfit.times == pytest.approx(3.5, rel=0.15)
+    assert "along x (right)" in misfit.text
+    assert points.misfits(errors - [3.0 * SD, 0.0, 0.0]) == ()
+
+
 def test_a_sure_excess_that_is_small_is_not_shouted_at(measured):
     points = measured(300)
     assert points.misfits(1.3 * points.noise(1)) == ()

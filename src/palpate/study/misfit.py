@@ -92,14 +92,17 @@ def _of_points(line: Linearisation, motions: PointMotions) -> Misfit | None:
     sizes, n = np.linalg.norm(scaled, axis=1), len(scaled)
     usual = float(np.sqrt(chi2.isf(TAIL, 3)))
     off = sizes > RELEVANT * usual
+    left = motions.fitted - motions.observed
+    alone, count = _alone(line, left, sd)
+    smooth, limit = _worst_direction(alone), _limit(count, DIRECTIONS)
     times, direction = _worst_direction(scaled)
     sure = bool(motions.labels) and sizes.max() > np.sqrt(chi2.isf(CHANCE / n, 3))
-    if not (times > _limit(n, DIRECTIONS) or _is_tail(float(off.mean()), n, off=3) or sure):
+    if not (times > _limit(n, DIRECTIONS) or smooth[0] > limit or _is_tail(float(off.mean()), n, off=3) or sure):
         return None
     what = f"the {name} in state {line.state + 1}"
-    left, others = motions.fitted - motions.observed, scaled[~off]
+    others = scaled[~off]
     spared = len(others) > 0 and _worst_direction(others)[0] <= _limit(len(others), DIRECTIONS)
-    if spared and 0.0 < off.mean() <= MOST:
+    if spared and _worst_direction(alone[~off])[0] <= limit and 0.0 < off.mean() <= MOST:
         far, worst = int(off.sum()), int(sizes.argmax())
         place = f"the one at {np.round(motions.rest[worst], 1).tolist()} mm (RAS)"
         which = f"'{motions.labels[worst]}'" if motions.labels else place
@@ -111,15 +114,18 @@ def _of_points(line: Linearisation, motions: PointMotions) -> Misfit | None:
             " in both states, or of a part that moves otherwise? Correct them, or take them out"
         )
         return Misfit(name, line.state, times, short, text, whole=False)
+    if smooth[0] > max(times, limit):
+        (times, direction), scaled = smooth, alone
     along = left.T @ (scaled @ direction)  # in space, whatever the errors' covariance makes of it
     along *= np.sign(along[np.abs(along).argmax()]) / np.linalg.norm(along)
     words = "".join(axis for axis, cosine in zip(AXES, along, strict=True) if cosine > ALONG)
     words = words or f"({', '.join(f'{cosine:.2f}' for cosine in along)})"
+    by = float(np.sqrt(np.mean((left @ along) ** 2)))
+    means = " in means of points that lie near each other" if by < 0.9 * times * sd else ""
     text = (
-        f"the fitted model misses {what} along {words} by {float(np.sqrt(np.mean((left @ along) ** 2))):.2g} mm (root"
-        f" mean square), {times:.2g} times what the stated error of {sd:.2g} mm explains. Check the file's state and"
-        " axes; try another law or another motion of the boundary; or state the error, and the length over which"
-        " errors are alike, that you can show"
+        f"the fitted model misses {what} along {words} by {by:.2g} mm (root mean square), {times:.2g} times what the"
+        f" stated error of {sd:.2g} mm explains{means}. Check the file's state and axes; try another law or another"
+        " motion of the boundary; or state the error, and the length over which errors are alike, that you can show"
     )
     short = f"{what} along {words.split(' (')[0]} by {times:.2g} times its stated error"
     return Misfit(name, line.state, times, short, text)
@@ -161,6 +167,18 @@ def _of_instrument(line: Linearisation, seen: OfInstrument) -> Misfit | None:
         " and its surface, or state a larger error"
     )
     return Misfit(observation.name, line.state, times, f"{what} by {times:.2g} times its stated error", text)
+
+
+def _alone(line: Linearisation, left: NDArray[np.float64], sd: float) -> tuple[NDArray[np.float64], float]:
+    """What is left (n, 3) mm of each point, over its stated error, and how many independent ones that is at the least.
+
+    Of errors that are alike a smooth misfit is a few of n independent residuals, and no larger than these in their
+    mean. The number is that by which the mean is known: (1 x c)^T C^-1 (1 x c) of the covariance C, at a unit vector c.
+    """
+    same = np.asarray(line.residuals.jacobian @ np.tile(np.eye(3), (len(left), 1)))
+    information = same.T @ same
+    count = 3.0 / float(np.trace(np.linalg.inv(information)))
+    return left @ np.linalg.cholesky(information / count) / sd, min(count, float(len(left)))
 
 
 def _worst_direction(scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
