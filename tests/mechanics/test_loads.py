@@ -19,15 +19,15 @@ from palpate.mesh.space import lagrange_space
 SIZE = 20.0
 
 
-def column(meshes, element="P2", n=2):
-    """A block that stands on the cut of the image; its top and sides face air."""
+def column(meshes, element="P2", n=2, *, beyond=-1):
+    """A block that stands on the cut of the image, or on what is `beyond`; its top and sides face air."""
     mesh = meshes.box_mesh(
         n,
         size=SIZE,
         distortion=0.15,
         tissues=[meshes.known("fat", nu=0.4), meshes.unknown("organ", nu=0.45), meshes.VOID],
         region=lambda c: (c[:, 2] > 0.5 * SIZE).astype(int),
-        beyond=lambda c: np.where(c[:, 2] < 1e-9, -1, 2),
+        beyond=lambda c: np.where(c[:, 2] < 1e-9, beyond, 2),
     )
     return lagrange_space(mesh, element)
 
@@ -155,6 +155,16 @@ def test_a_loaded_body_that_floats_is_refused_with_its_rigid_motions(meshes):
     nothing = meshes.prescribe(space, np.zeros(0, int), np.zeros((0, 3)))
     with pytest.raises(GeometryError, match=r"the body floats.*translation along x \(right\).*rotation about z"):
         outer_constraint(space, outer="free", **nothing)
+
+
+@pytest.mark.parametrize("outer", ["free", "sliding", "fixed", "moving"])
+def test_a_body_that_floats_is_told_to_be_fixed_at_its_cut_only_where_it_has_one_that_is_not(meshes, outer):
+    nothing = meshes.prescribe(column(meshes), np.zeros(0, int), np.zeros((0, 3)))
+    bodies = {"cut": column(meshes), "not cut": column(meshes, beyond=2)}
+    for name in bodies if outer in ("free", "sliding") else ["not cut"]:
+        with pytest.raises(GeometryError, match="the body floats") as refused:
+            outer_constraint(bodies[name], outer=outer, **nothing)
+        assert ("outer_boundary = 'fixed'" in str(refused.value)) == (name == "cut")
 
 
 def test_surfaces_have_the_names_of_what_lies_behind_them(meshes):

@@ -8,6 +8,7 @@ import hashlib
 import json
 import re
 from html.parser import HTMLParser
+from itertools import combinations
 from pathlib import Path
 
 import matplotlib.figure
@@ -298,6 +299,45 @@ def test_what_did_not_converge_shows_no_number(case_result):
     assert "not identified" in table
     assert "There is no result; these were noticed" in page
     assert page.count("is drawn where it stopped, and is no result") == 2
+
+
+STEPS = "the iteration reached its largest number of steps"
+ENDS = {  # status, reason, number of the minimum, the share of the steps that were made, misfit
+    "the answer": ("converged", "ok", 0, 1.0, 0.02),
+    "another answer": ("converged", "ok", 1, 1.0, 0.03),
+    "a worse fit that was not followed": ("converged", "ok", None, 1.0, 0.3),
+    "no end": ("not converged", STEPS, None, 1.0, 0.5),
+    "no end near the answer": ("not converged", STEPS, 0, 0.5, 0.021),
+    "no number at all": ("not converged", "the objective is not a finite number", None, 0.0, np.nan),
+}
+MIXES = [*((end,) for end in ENDS), *combinations(ENDS, 2), tuple(ENDS)]
+
+
+def ended(start, end):
+    status, reason, minimum, share, misfit = ENDS[end]
+    history = start.history[: round(share * len(start.history))]
+    changes = {"status": status, "reason": reason, "minimum": minimum, "history": history}
+    return dataclasses.replace(start, objective_mm2=misfit, **changes)
+
+
+@pytest.mark.parametrize("status", ["converged", "not converged"])
+def test_a_report_is_written_however_starts_ended(case_result, status):
+    """Of each kind of end alone, of each two of them, of all: a row a start, its number or a dash."""
+    first, drawn = case_result.estimation.starts[0], dataclasses.replace(collect(case_result), later=(), mesh=None)
+    for mix in MIXES:
+        starts = tuple(ended(first, end) for end in mix)
+        estimation = dataclasses.replace(case_result.estimation, starts=starts, status=status)
+        document = dataclasses.replace(case_result, estimation=estimation).to_dict()
+        page = section_of_starts(dataclasses.replace(drawn, document=document))
+        minima = re.findall(r'data-k="minimum">([^<]*)<', page)
+        assert minima == ["–" if ENDS[end][2] is None else str(ENDS[end][2] + 1) for end in mix]
+        assert re.findall(r'data-k="status">([^<]*)<', page) == [ENDS[end][0] for end in mix]
+
+
+def section_of_starts(data):
+    page = render(data)
+    assert "could not be drawn" not in page
+    return page[page.index('id="starts"') :]
 
 
 def test_an_estimate_that_failed_has_a_report_too(case_result, tmp_path):

@@ -72,6 +72,13 @@ def test_starts_that_disagree_are_told_of():
     assert "same answer from all 3" in " ".join(headline(document("weak", minima=(0, 0, 0))).sentences)
 
 
+@pytest.mark.parametrize(("minima", "count"), [((0, None, 0), 2), ((None, 0, None), 1), ((None, None, None), 0)])
+def test_starts_that_led_nowhere_are_not_said_to_agree(minima, count):
+    said = " ".join(headline(document("weak", minima=minima)).sentences)
+    assert f"from {count} of 3 starts" in said
+    assert "all 3" not in said
+
+
 @pytest.mark.parametrize(
     ("names", "words"), [([], ""), (["a"], "a"), (["a", "b"], "a and b"), (["a", "b", "c"], "a, b and c")]
 )

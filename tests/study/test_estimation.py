@@ -157,10 +157,28 @@ def test_what_did_not_converge_says_so(inversion, settings, observed):
     assert result.status == "not converged"
     assert "largest number of steps" in result.reason
     assert "0 of 2 starts" in result.reason
+    assert "converged" not in result.reason
     assert {start.status for start in result.starts} == {"not converged"}
     assert {(e.value, e.interval95, e.ratio, e.verdict) for e in result.estimates} == {
         (None, None, None, "not identified")
     }
+
+
+def test_an_estimate_that_did_not_end_is_not_said_to_have_converged_where_its_starts_did(inversion, settings, observed):
+    ended = with_candidate(inversion, minimum=replace(inversion.minimum, outcome=Outcome.STUCK))
+    result = stated(ended, settings, observed)
+    assert result.status == "not converged"
+    assert {start.status for start in result.starts} == {"converged"}
+    assert "2 of 2 starts led to 1 distinct minimum" in result.reason
+    assert "converged" not in result.reason
+    assert not any("converged" in of.why for of in result.estimates)
+
+
+def test_starts_that_were_not_followed_are_no_minimum(inversion, settings, observed):
+    first, second = inversion.starts
+    result = stated(replace(inversion, starts=(first, replace(second, candidate=None))), settings, observed)
+    assert "2 of 2 starts converged, to 1 distinct minimum" in result.reason
+    assert [start.minimum for start in result.starts] == [0, None]
 
 
 def test_one_start_that_converged_is_enough(inversion, settings, observed):

@@ -161,6 +161,26 @@ def test_every_file_of_an_estimate_is_written(folder, tmp_path, capsys):
     assert "force: 0.8 N on 'grip'" in capsys.readouterr().out
 
 
+def test_a_motion_along_the_pull_that_the_model_lacks_is_told_beside_the_verdict(folder, result, tmp_path, capsys):
+    """Of 3.5 stated errors in the middle, the others fitting; data as they are stated are no misfit."""
+    assert "data-misfit" not in [remark.code for remark in result.all_remarks]
+    table = np.loadtxt(folder / "field.csv", delimiter=",", skiprows=1)
+    table[:, 5] -= 0.05 * np.exp(-0.5 * ((table[:, 2] - 0.5 * SIZE[2]) / 6.0) ** 2) * np.cos(table[:, 0] / 3.0)
+    head = "before_x,before_y,before_z,after_x,after_y,after_z"
+    np.savetxt(folder / "otherwise.csv", table, delimiter=",", header=head, comments="")
+    (folder / "otherwise.toml").write_text(CASE.replace("field.csv", "otherwise.csv"))
+    assert main(["estimate", str(folder / "otherwise.toml"), "--output", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    document = json.loads((tmp_path / "out" / "result.json").read_text())
+    (bar,) = document["estimates"]
+    assert bar["verdict"] == "weak"
+    assert re.search(r"but the model misses the displacement-field in state 1 along z by \d(\.\d)? times", bar["why"])
+    assert "weak, but data are missed" in printed
+    (warning,) = (warning for warning in document["warnings"] if warning["code"] == "data-misfit")
+    assert "along z (superior)" in warning["message"]
+    assert (tmp_path / "out" / "report.html").exists()
+
+
 def test_check_finds_no_fault(folder):
     report = check_case(folder / "case.toml", [], progress=lambda _: None)
     assert report.exit_code == 0

@@ -34,6 +34,7 @@ def estimates_table(document: Mapping[str, Any]) -> str:
     from palpate.report.rows import NONE, expected_share, interval_text, main_numbers, moduli_in, number, ratio_rows
 
     rows = [["tissue", "Young's modulus", "95 % interval", "ratio", "verdict", "truth"]]
+    missed = any(warning["code"] == "data-misfit" for warning in document["warnings"])
     for item in moduli_in(document):
         interval, ratio = item["interval95"], number(item["ratio"])
         value, unit = number(item["value"]) + (" kPa" if item["value"] is not None else ""), " kPa"
@@ -48,7 +49,7 @@ def estimates_table(document: Mapping[str, Any]) -> str:
                 value,
                 interval_text(interval) + (unit if interval else ""),
                 f"{ratio} to {item['relative_to']}" if item["ratio"] is not None else "–",
-                item["verdict"],
+                item["verdict"] + (", but data are missed" if missed and item["verdict"] != "not identified" else ""),
                 number(item["truth"]),
             ]
         )

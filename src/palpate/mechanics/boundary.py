@@ -60,8 +60,11 @@ def outer_constraint(
     dyads, held = np.einsum("fi,fj->fij", normals, normals), np.zeros((n, 3, 3))
     for column in space.facets(sliding).T:  # the sum of n (x) n over the unit normals n of the faces at each point
         np.add.at(held, column, dyads)
-    if outer in ("fixed", "moving"):
-        held[np.unique(space.facets(cut))] = np.eye(3)
+    on_cut = np.zeros(n, dtype=bool)
+    on_cut[space.facets(cut).ravel()] = True
+    cut_is_held = outer in ("fixed", "moving")
+    if cut_is_held:
+        held[on_cut] = np.eye(3)
     held[prescribed] = np.eye(3)
     values, vectors = np.linalg.eigh(held)  # point by point free are the directions with no part in `held`
     point, direction = np.nonzero(values <= SAME_PLANE * np.maximum(values[:, -1:], np.finfo(float).tiny))
@@ -69,7 +72,7 @@ def outer_constraint(
     entries, shape = (vectors[point, :, direction].ravel(), (rows, columns)), (3 * n, len(point))
     free: sparse.csr_matrix[np.float64] = sparse.csr_matrix(entries, shape=shape)
     free.eliminate_zeros()
-    refuse_floating(space, free)
+    refuse_floating(space, free, on_cut & (not cut_is_held))
     return Constraint(free=free, modes=np.array(modes, dtype=float), offset=np.array(offset, dtype=float))
 
 

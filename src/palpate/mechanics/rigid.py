@@ -29,8 +29,11 @@ def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack(translations + rotations, axis=1)
 
 
-def refuse_floating(space: LagrangeSpace, free: sparse.csr_matrix[np.float64]) -> None:
-    """Raise `GeometryError` when a connected part of the mesh can move rigidly within `free` (n_dof, n_free)."""
+def refuse_floating(space: LagrangeSpace, free: sparse.csr_matrix[np.float64], holdable: NDArray[np.bool_]) -> None:
+    """Raise `GeometryError` when a connected part of the mesh can move rigidly within `free` (n_dof, n_free).
+
+    holdable (n_points,): on the image's cut, where another `outer_boundary` would hold them.
+    """
     first = np.repeat(space.cells[:, 0], space.cells.shape[1] - 1)
     second = space.cells[:, 1:].ravel()
     n = len(space.points)
@@ -49,10 +52,11 @@ def refuse_floating(space: LagrangeSpace, free: sparse.csr_matrix[np.float64]) -
             loose.append(name if pure else f"a motion that is mostly {name}")
         if loose:
             centre = np.round(space.points[points].mean(axis=0), 1).tolist()
+            by_cut = "outer_boundary = 'fixed', with " if holdable[points].any() else ""
             raise GeometryError(
                 f"the body floats: a part of {len(points)} points around {centre} mm (RAS) has no support against"
-                f" {', '.join(loose)}; hold it with outer_boundary = 'fixed', with a `rigid` or `driver` tissue or a"
-                " held surface of its mesh, or remove it from the labels"
+                f" {', '.join(loose)}; hold it with {by_cut}a `rigid` or `driver` tissue or a held surface of its mesh,"
+                " or remove it from the labels"
             )
 
 

@@ -278,17 +278,24 @@ def headline(document: Mapping[str, Any]) -> Headline:
     for item in moduli_in(document):
         verdicts.setdefault(item["verdict"], []).append(item["tissue"])
     sentences = [FOUND[verdict].format(listed(verdicts[verdict])) for verdict in FOUND if verdict in verdicts]
-    starts = document["starts"]
-    if len(starts) > 1:
-        answers = len({start["minimum"] for start in starts if start["minimum"] is not None})
-        several = f"The search from {len(starts)} starts led to {answers} different answers; the best one is shown."
-        same = f"The search led to the same answer from all {len(starts)} starts."
-        sentences.append(several if answers > 1 else same)
+    sentences += _of_starts([start["minimum"] for start in document["starts"]])
     if lost := verdicts.get("not identified"):
         title = OPEN.format(listed(lost), "its number" if len(lost) == 1 else "their numbers")
         return Headline("bad", title, tuple(sentences), warnings, reason)
     good = set(verdicts) <= {"identified", "ratio only"} and not count
     return Headline("good" if good else "fair", "A result was found.", tuple(sentences), warnings, reason)
+
+
+def _of_starts(minima: Sequence[int | None]) -> list[str]:
+    """Where the starts led, by the number of each one's minimum, None where it was not followed; nothing of one."""
+    n, led = len(minima), [minimum for minimum in minima if minimum is not None]
+    if n < 2:
+        return []
+    if (answers := len(set(led))) > 1:
+        return [f"The search from {n} starts led to {answers} different answers; the best one is shown."]
+    if len(led) == n:
+        return [f"The search led to the same answer from all {n} starts."]
+    return [f"The search led to an answer from {len(led)} of {n} starts; the others stopped, or fitted worse."]
 
 
 def listed(names: Sequence[str]) -> str:

@@ -11,13 +11,12 @@ from palpate.findings import Finding
 from palpate.images.checks import later_names
 from palpate.inversion import Inversion, Outcome
 from palpate.mechanics.element import deformation_determinants
-from palpate.observation.contract import Imaged, OfInstrument
+from palpate.observation.contract import OfInstrument
 from palpate.study.together import ImagePairs
 from palpate.uncertainty import FittedState
 
 STRONG_CORRELATION = 0.99
 HETEROGENEOUS = 0.01  # probability of such differences between image pairs that have the same moduli
-MISFIT = 1.5  # times the stated standard deviation: measurements that are not what they are said to be
 NOISIER, LEAST_IMAGES = 1.6, 3  # times the usual noise of so many later images: one is drawn badly
 
 
@@ -106,10 +105,7 @@ def pair_findings(pairs: ImagePairs | None) -> tuple[Finding, ...]:
 
 
 def data_findings(inversion: Inversion) -> tuple[Finding, ...]:
-    """A finding for each kind of measurements beside the images that the model misses by more than is stated.
-
-    And for each reading of an instrument whose sign no modulus gives.
-    """
+    """A finding for each reading of an instrument whose sign no modulus gives."""
     findings, mapping, unknowns = [], inversion.objective.parameters, inversion.minimum.unknowns
     for line in inversion.minimum.evaluation.linearisations:
         seen = line.observation
@@ -124,13 +120,6 @@ def data_findings(inversion: Inversion) -> tuple[Finding, ...]:
                     " direction round. It is positive where it pulls the surface along its direction"
                 )
                 findings.append(Finding("force-reversed", text, seen.name, place=f"in state {line.state + 1}"))
-        stated, found = seen.first_noise((seen,)).sd, seen.noise_model.sd
-        if not isinstance(seen, Imaged) and found > MISFIT * stated:
-            text = (
-                f"the fitted model misses the {seen.name} by {found:.2g} mm where sd_mm = {stated:.2g} is stated; they"
-                " count by the former. Are they of this state, and is their error larger than stated?"
-            )
-            findings.append(Finding("data-misfit", text, seen.name, place=f"in state {line.state + 1}"))
     return tuple(findings)
 
 

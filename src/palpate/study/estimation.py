@@ -23,6 +23,7 @@ from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, di
 from palpate.study.estimate_findings import data_findings, fold_findings, inversion_findings, pair_findings
 from palpate.study.estimated import Estimation, ForceFit, Iteration, PointFit, Start, TissueFit
 from palpate.study.map_words import map_findings
+from palpate.study.misfit import beside_misfits, misfits_of
 from palpate.study.poisson_ratios import NOT_IDENTIFIED
 from palpate.study.samples import CHAINS, draw_moduli, sample_findings
 from palpate.study.stated_posterior import stated_posteriors
@@ -72,7 +73,10 @@ def conclude(
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors)
     known = intervals_of(inversion, settings, posteriors)
-    estimates = estimates_of(inversion, known, covariance, truth=truth)
+    fits, forces, points = _seen(inversion, observed)
+    misfits = misfits_of(minimum.evaluation.linearisations, points, observed.states[0].space.mesh.tissues)
+    told = misfits if minimum.converged else ()
+    estimates = beside_misfits(estimates_of(inversion, known, covariance, truth=truth), told)
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
     stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
     pairs = pairs and pairs.with_intervals_of(stating)
@@ -88,12 +92,12 @@ def conclude(
     if minimum.converged:  # of each kind of data in what is known of a tissue's modulus
         of_tissues = information_shares(minimum.evaluation, objective.n_parameters)
         shares = dict(zip(objective.parameters.tissues, of_tissues, strict=False))
-    fits, forces, points = _seen(inversion, observed)
     findings = (
         *inversion_findings(inversion, covariance.total),
         *pair_findings(pairs),
         *fold_findings(observed.states),
         *data_findings(inversion),
+        *(misfit.finding for misfit in misfits),
         *sample_findings(drawn),
         *discrepancy_findings(found_discrepancy),
         *map_findings(maps),
@@ -102,7 +106,7 @@ def conclude(
         status="converged" if minimum.converged else "not converged",
         reason=_reason(inversion),
         estimates=estimates,
-        poisson_ratios=ratios_of(inversion, known, covariance),
+        poisson_ratios=beside_misfits(ratios_of(inversion, known, covariance), told),
         covariance=covariance,
         starts=tuple(_start(inversion, start) for start in inversion.starts),
         fits=fits,
@@ -126,14 +130,20 @@ def conclude(
 
 
 def _reason(inversion: Inversion) -> str:
-    """How the estimate ended, and what became of the starts."""
-    converged = sum(start.minimum.converged for start in inversion.starts)
-    distinct = {s.candidate for s in inversion.starts if s.minimum.converged}
+    """How the estimate ended, and what became of the starts.
+
+    These are followed alone on the cheapest model: all of them may end, and the estimate that goes on from there not.
+    """
+    ended = [start.candidate for start in inversion.starts if start.minimum.converged]
+    distinct = len({candidate for candidate in ended if candidate is not None})
+    minima = f"{distinct} distinct {'minimum' if distinct == 1 else 'minima'}"
+    starts = f"{inversion.minimum.outcome.value}; {len(ended)} of {len(inversion.starts)} starts"
+    if not inversion.minimum.converged:
+        return f"{starts} led to {minima} of the model that they share, from where the estimate went on and did not end"
     outcomes = [candidate.minimum.outcome for candidate in inversion.candidates]
     lost, left = outcomes.count(Outcome.NO_EQUILIBRIUM), outcomes.count(Outcome.NOT_FOLLOWED)
     return (
-        f"{inversion.minimum.outcome.value}; {converged} of {len(inversion.starts)} starts converged,"
-        f" to {len(distinct)} distinct {'minimum' if len(distinct) == 1 else 'minima'}"
+        f"{starts} converged, to {minima}"
         + (f", {lost} of which {'has' if lost == 1 else 'have'} no equilibrium under the law" if lost else "")
         + (f", {left} of which could not be followed under the law" if left else "")
     )
