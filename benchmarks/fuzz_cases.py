@@ -148,7 +148,7 @@ def become_command(argv: list[str], said: int) -> None:
         sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
         resource.setrlimit(resource.RLIMIT_CPU, (COMMAND_SECONDS, COMMAND_SECONDS))
         warnings.simplefilter("default")
-        run.inverted = solving_begins
+        vars(run)["inverted"] = solving_begins
         try:
             code = palpate_command(argv)
         except SystemExit as stop:
