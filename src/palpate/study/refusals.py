@@ -27,8 +27,9 @@ ORGANS = (Role.ESTIMATE, Role.DRIVER)
 LINEAR_RANGE = 0.10  # principal strain: beyond it the squares that the linear law leaves out are tenths of it
 MOST_BEYOND = 0.01  # share of the meshed volume
 NOTHING_MOVES = (
-    'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), so no'
-    " modulus can be estimated; give the role driver to the hollow organ whose wall deforms the others"
+    'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), and no load or'
+    " force is known, so no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the"
+    ' others, a surface of a mesh the boundary "moving" or "prescribed", or state a load'
 )
 MOVES_MM = 1e-6  # less is rounding
 
