@@ -2,16 +2,18 @@
 
 Keywords: Abaqus Analysis User's Guide; CalculiX CrunchiX User's Manual 2.20, chapter 7 (which takes the same file). The
 hyperelastic laws of both are decoupled, W = C10 (J^(-2/3) I1 - 3) + C01 (J^(-4/3) I2 - 3) + (J - 1)^2 / D1, ours are
-not: C10, C01 and D1 = 2 / K give the same moduli at small strain, mu and K, and docs/export.md the difference.
+not: C10, C01 and D1 = 2 / K give the same moduli at small strain, mu and K, and docs/export.md the difference. Both take
+the forces on a node with a *TRANSFORM along the axes of that, as they do what holds it, and pressures as ever.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from palpate.export.conditions import prescribed
+from palpate.export.conditions import Prescribed, prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.groups import (
     OFF,
@@ -26,7 +28,7 @@ from palpate.export.groups import (
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
-from palpate.mechanics.loads import FollowingPressure
+from palpate.mechanics.loads import FollowingPressure, Load
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case_loads import loads_on
 from palpate.study.outputs import write_text
@@ -87,10 +89,7 @@ def _text(model: FittedModel, body: FittedBody, space: LagrangeSpace, element: s
 
 
 def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[str]:
-    """A step a later image: walls, bones and the cut of the image where the fit has them, and the known loads.
-
-    A pressure that follows its surface acts on the elements' faces; other loads are their forces on the nodes, mN.
-    """
+    """A step a later image: walls, bones and the cut of the image where the fit has them, and the known loads."""
     held = prescribed(body, space, outer=model.outer_boundary)
     parts = []
     if not held.along_world:
@@ -106,17 +105,31 @@ def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[s
             parts += [rows("%d, %d, %d, %.12g", held.whole + 1, along, along, displacement[held.whole, axis])]
             still = held.sliding[held.held[:, axis]] + 1
             parts += [rows("%d, %d, %d", still, np.full(len(still), axis + 1), np.full(len(still), axis + 1))]
-        if any(body.loads[: number - 1]):  # what acted in the step before does not stay
-            parts += ["*CLOAD, OP=NEW\n*DLOAD, OP=NEW\n"]
-        new = ", OP=NEW" if number > 1 else ""
-        for load in loads_on(space, body.loads[number - 1], densities=model.densities):
-            if isinstance(load, FollowingPressure):
-                cells, faces = element_faces(body.mesh, load.faces[:, :3])
-                pressures = np.full(len(cells), load.kilopascal)
-                parts += [f"*DLOAD{new}\n", rows("%d, P%d, %.12g", cells + 1, FACE[faces], pressures)]
-            else:
-                forces = load.forces(np.zeros_like(space.points)).reshape(-1, 3)
-                points, axes = np.nonzero(forces)
-                parts += [f"*CLOAD{new}\n", rows("%d, %d, %.12g", points + 1, axes + 1, forces[points, axes])]
-        parts += ["*NODE PRINT, NSET=ALL_NODES\nU\n*NODE FILE\nU\n*END STEP\n"]
+        acting, before = loads_on(space, body.loads[number - 1], densities=model.densities), body.loads[: number - 1]
+        parts += _loads(space, held, acting, new=", OP=NEW" if any(before) else "")
+        outputs = "*NODE PRINT, NSET=ALL_NODES, GLOBAL=YES\nU, RF\n*NODE FILE, GLOBAL=YES\nU, RF\n*END STEP\n"
+        parts.append(outputs)
     return parts
+
+
+def _loads(space: LagrangeSpace, held: Prescribed, loads: tuple[Load, ...], *, new: str) -> Iterator[str]:
+    """What acts in a step, each node and face once; `new` where something acted before, which does not stay.
+
+    A pressure that follows its surface acts on the elements' faces; other loads are their forces on the nodes, mN.
+    """
+    forces = np.zeros_like(space.points)
+    pressure = np.zeros((len(space.mesh.tets), 4))
+    for load in loads:
+        if isinstance(load, FollowingPressure):
+            np.add.at(pressure, element_faces(space.mesh, load.faces[:, :3]), load.kilopascal)
+        else:
+            forces += load.forces(np.zeros_like(forces)).reshape(-1, 3)
+    forces[held.sliding] = forces[held.sliding] @ held.axes.T
+    points, axes = np.nonzero(forces)
+    if new or len(points):
+        yield f"*CLOAD{new}\n"
+        yield rows("%d, %d, %.12g", points + 1, axes + 1, forces[points, axes])
+    cells, faces = np.nonzero(pressure)
+    if new or len(cells):
+        yield f"*DLOAD{new}\n"
+        yield rows("%d, P%d, %.12g", cells + 1, FACE[faces], pressure[cells, faces])
