@@ -8,12 +8,12 @@ the forces on a node with a *TRANSFORM along the axes of that, as they do what h
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from palpate.export.conditions import Prescribed, prescribed
+from palpate.export.conditions import prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.groups import (
     OFF,
@@ -35,7 +35,7 @@ from palpate.study.outputs import write_text
 
 FACE = np.array([3, 4, 2, 1])  # Abaqus' number of each row of FACES
 LAWS = (Linear, NeoHookean, MooneyRivlin)  # that it has
-INCREMENT = 0.2  # of a step at finite strain, at first
+INCREMENT, LEAST = 0.2, 1e-6  # of a step at finite strain, at first and at the least
 
 
 def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
@@ -89,15 +89,18 @@ def _text(model: FittedModel, body: FittedBody, space: LagrangeSpace, element: s
 
 
 def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[str]:
-    """A step a later image: walls, bones and the cut of the image where the fit has them, and the known loads."""
-    held = prescribed(body, space, outer=model.outer_boundary)
+    """A step a later image: walls, bones and the cut of the image where the fit has them, and the known loads.
+
+    Each node and face is loaded once; what acted in the step before is stated too, and goes evenly to what it is now.
+    """
+    held, acting = prescribed(body, space, outer=model.outer_boundary), _summed(space, ())
     parts = []
     if not held.along_world:
         parts += ["*NSET, NSET=SLIDING\n", wrapped(held.sliding + 1), "*TRANSFORM, NSET=SLIDING, TYPE=R\n"]
         parts += [", ".join(f"{x:.12g}" for x in held.axes[:2].ravel()) + "\n"]
     finite = model.material_law.finite
     for number, displacement in enumerate(body.displacements, start=1):
-        increments = f"{INCREMENT:g}, 1.\n" if finite else ""
+        increments = f"{INCREMENT:g}, 1., {LEAST:g}\n" if finite else ""
         parts += [f"** later image {number}\n*STEP{', NLGEOM, INC=1000' if finite else ''}\n*STATIC\n{increments}"]
         parts += ["*BOUNDARY\n"]
         for axis in range(3):
@@ -105,31 +108,25 @@ def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[s
             parts += [rows("%d, %d, %d, %.12g", held.whole + 1, along, along, displacement[held.whole, axis])]
             still = held.sliding[held.held[:, axis]] + 1
             parts += [rows("%d, %d, %d", still, np.full(len(still), axis + 1), np.full(len(still), axis + 1))]
-        acting, before = loads_on(space, body.loads[number - 1], densities=model.densities), body.loads[: number - 1]
-        parts += _loads(space, held, acting, new=", OP=NEW" if any(before) else "")
+        loads = loads_on(space, body.loads[number - 1], densities=model.densities)
+        acting, before = _summed(space, loads), acting
+        acting[0][held.sliding] = acting[0][held.sliding] @ held.axes.T
+        stated = [np.nonzero((now != 0.0) | (then != 0.0)) for now, then in zip(acting, before, strict=True)]
+        points, axes = stated[0]
+        cells, faces = stated[1]
+        parts += ["*CLOAD\n" * (len(points) > 0), rows("%d, %d, %.12g", points + 1, axes + 1, acting[0][stated[0]])]
+        parts += ["*DLOAD\n" * (len(cells) > 0), rows("%d, P%d, %.12g", cells + 1, FACE[faces], acting[1][stated[1]])]
         outputs = "*NODE PRINT, NSET=ALL_NODES, GLOBAL=YES\nU, RF\n*NODE FILE, GLOBAL=YES\nU, RF\n*END STEP\n"
         parts.append(outputs)
     return parts
 
 
-def _loads(space: LagrangeSpace, held: Prescribed, loads: tuple[Load, ...], *, new: str) -> Iterator[str]:
-    """What acts in a step, each node and face once; `new` where something acted before, which does not stay.
-
-    A pressure that follows its surface acts on the elements' faces; other loads are their forces on the nodes, mN.
-    """
-    forces = np.zeros_like(space.points)
-    pressure = np.zeros((len(space.mesh.tets), 4))
+def _summed(space: LagrangeSpace, loads: tuple[Load, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Forces on the nodes (n_points, 3) mN of what stays as it is, pressures on faces (n_tets, 4) kPa of what follows."""
+    forces, pressure = np.zeros_like(space.points), np.zeros((len(space.mesh.tets), 4))
     for load in loads:
         if isinstance(load, FollowingPressure):
             np.add.at(pressure, element_faces(space.mesh, load.faces[:, :3]), load.kilopascal)
         else:
             forces += load.forces(np.zeros_like(forces)).reshape(-1, 3)
-    forces[held.sliding] = forces[held.sliding] @ held.axes.T
-    points, axes = np.nonzero(forces)
-    if new or len(points):
-        yield f"*CLOAD{new}\n"
-        yield rows("%d, %d, %.12g", points + 1, axes + 1, forces[points, axes])
-    cells, faces = np.nonzero(pressure)
-    if new or len(cells):
-        yield f"*DLOAD{new}\n"
-        yield rows("%d, P%d, %.12g", cells + 1, FACE[faces], pressure[cells, faces])
+    return forces, pressure
