@@ -1,7 +1,7 @@
 """CalculiX solves what we export: displacements and nodal forces beside ours. https://www.calculix.de.
 
-The demo's pelvis lies straight; the turned body slides along planes that are oblique in space, under gravity, a pressure
-that follows its surface and a traction. Displacements are read from .dat (every node, 7 digits) and .frd (6 digits).
+The demo's pelvis lies straight; the turned body slides along planes that are oblique in space, under gravity, a
+pressure that follows its surface and a traction. Displacements are read from .dat (7 digits) and .frd (6 digits).
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ from palpate.study.case_loads import loads_on
 
 Array = NDArray[np.float64]
 
-EQUAL = 0.01  # per cent, between two solutions of the same problem: CalculiX stops its iterations at 0.5 % of the forces
+EQUAL = (
+    0.01  # per cent, between two solutions of the same problem: CalculiX stops its iterations at 0.5 % of the forces
+)
 LIMITS = {"linear": 0.1, "neo-hookean": 0.5}  # per cent; at finite strain its law is another one
 
 
@@ -63,7 +65,9 @@ def calculix(results: Results, folder: Path) -> Iterator[Row]:
             same = under_decoupled_law(result)
             words = f"{name}: RMS to ours under its own volumetric term"
             yield Row("CalculiX", words, percent(found.displacement, same), EQUAL, "%")
-            yield Row("Palpate", f"{name}: our law to that of CalculiX, both solved by us", percent(same, ours), 0.5, "%")
+            yield Row(
+                "Palpate", f"{name}: our law to that of CalculiX, both solved by us", percent(same, ours), 0.5, "%"
+            )
 
 
 def loads_compared(name: str, result: palpate.CaseResult, found: Solved) -> Iterator[Row]:
@@ -74,7 +78,9 @@ def loads_compared(name: str, result: palpate.CaseResult, found: Solved) -> Iter
     heavy = np.array([density[tissue.name] for tissue in result.tissues])
     acting = loads_on(result.space, case.loads_in(1), densities=heavy)
     place = found.displacement if case.mechanics.material_law.finite else np.zeros_like(found.displacement)
-    ours = np.asarray(free @ (free.T @ sum(load.forces(place) for load in acting))).reshape(-1, 3)
+    ours = np.asarray(free @ (free.T @ sum((load.forces(place) for load in acting), np.zeros(place.size)))).reshape(
+        -1, 3
+    )
     theirs = np.asarray(free @ (free.T @ found.forces.ravel())).reshape(-1, 3)
     total, expected = theirs.sum(axis=0), ours.sum(axis=0)
     both = " and ".join("(" + ", ".join(f"{x:.1f}" for x in vector) + ")" for vector in (total, expected))

@@ -3,9 +3,9 @@
     make export-check
     python benchmarks/export_check.py [--edge 12] [--only calculix,gmsh,...] [--json]
 
-The demo's pelvis is estimated three times: linear with P2, neo-Hookean with P2 and with the default element; a body that
-is turned in space and slides, under known loads, twice. Every line has a figure and its limit; a program or library that
-is not installed is a line without a figure, and the exit code is 5 where a limit is not kept.
+The demo's pelvis is estimated three times: linear with P2, neo-Hookean with P2 and with the default element; a body
+that is turned in space and slides, under known loads, twice. Every line has a figure and its limit; a program
+that is not installed is a line without a figure, and the exit code is 5 where a limit is not kept.
 """
 
 from __future__ import annotations

@@ -1,28 +1,28 @@
-"""What dolfinx reads of palpate.msh and palpate.xdmf, as a line of JSON; for the system's Python, see export_meshes.py."""
+"""What dolfinx reads of palpate.msh and palpate.xdmf, a line of JSON; export_meshes.py runs it in Debian's Python."""
 
 from __future__ import annotations
 
 import json
 import sys
+from importlib import import_module
+from typing import Any
 
-import dolfinx
-import gmsh
 import numpy as np
-from dolfinx.io import XDMFFile, gmshio
-from mpi4py import MPI
 
 
 def main() -> None:
     """Read both files that are named and tell of them."""
+    gmsh, dolfinx, io = import_module("gmsh"), import_module("dolfinx"), import_module("dolfinx.io")
+    world = import_module("mpi4py.MPI").COMM_WORLD
     gmsh.initialize()
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.open(sys.argv[1])
-    mesh, cells, faces = gmshio.model_to_mesh(gmsh.model, MPI.COMM_WORLD, 0, 3)
+    mesh, cells, faces = io.gmshio.model_to_mesh(gmsh.model, world, 0, 3)
     names = {group: gmsh.model.getPhysicalName(*group) for group in gmsh.model.getPhysicalGroups()}
     tissues = {tag: name for (dimension, tag), name in names.items() if dimension == 3}
     counts = {name: len(faces.find(tag)) for (dimension, tag), name in names.items() if dimension == 2}
     gmsh.finalize()
-    with XDMFFile(MPI.COMM_WORLD, sys.argv[2], "r") as file:
+    with io.XDMFFile(world, sys.argv[2], "r") as file:
         again = file.read_mesh(name="Grid")
         tags = file.read_meshtags(again, name="Grid")
     found = {
@@ -34,7 +34,7 @@ def main() -> None:
     print(json.dumps(found))
 
 
-def told(mesh, tags, tissues):
+def told(mesh: Any, tags: Any, tissues: dict[int, str]) -> dict[str, Any]:
     """Nodes, cells, and the volume of each tissue, mm^3, by the corners of its tetrahedra."""
     places = mesh.geometry.dofmap
     rows = np.array([places.links(cell)[:4] for cell in range(places.num_nodes)])

@@ -48,7 +48,12 @@ def nifti(results: Results, folder: Path) -> Iterator[Row]:
             yield Row(part, f"{kind}, {name}.nii.gz: voxels of another value or place", wrong, 0)
             if not known.all():
                 zeros = int(np.count_nonzero(found[~known] == 0.0))
-                yield Row(part, f"{kind}, {name}.nii.gz: voxels of NaN that are read as other than 0", (~known).sum() - zeros, 0)
+                yield Row(
+                    part,
+                    f"{kind}, {name}.nii.gz: voxels of NaN that are read as other than 0",
+                    (~known).sum() - zeros,
+                    0,
+                )
 
 
 def misplaced(grid: VoxelGrid, shape: tuple[int, ...], affine: Array) -> int:

@@ -1,4 +1,4 @@
-"""gmsh, meshio, trimesh, dolfinx and the schema of FEBio read our meshes: nodes, cells, groups, volumes, displacement."""
+"""gmsh, meshio, trimesh, dolfinx and FEBio's schema read our meshes: nodes, cells, groups, volumes, displacement."""
 
 from __future__ import annotations
 
@@ -13,7 +13,19 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from export_rows import VOLUME, Results, Row, any_of, installed, missing, percent, ran, tetrahedra, volumes_of, worst_volume
+from export_rows import (
+    VOLUME,
+    Results,
+    Row,
+    any_of,
+    installed,
+    missing,
+    percent,
+    ran,
+    tetrahedra,
+    volumes_of,
+    worst_volume,
+)
 
 import palpate
 from palpate.export import fitted_bodies
@@ -33,7 +45,9 @@ def gmsh(results: Results, folder: Path) -> Iterator[Row]:
         yield from missing("gmsh of Debian", what)
     else:
         said = ran([program, "-check", path, "-"], folder)
-        yield Row("gmsh of Debian", what, said.count("Warning") + said.count("Error") + said.count("uplicate nodes found"), 0)
+        yield Row(
+            "gmsh of Debian", what, said.count("Warning") + said.count("Error") + said.count("uplicate nodes found"), 0
+        )
     if module is None:
         yield from missing("gmsh", "volumes, groups, displacement")
         return
@@ -95,13 +109,28 @@ def meshes(results: Results, folder: Path) -> Iterator[Row]:
         yield Row("meshio", f"{name}: nodes and tetrahedra lost or gained", lost, 0)
         if name != "abaqus":
             ours = result.estimation.displacements[-1]
-            yield Row("meshio", f"{name}: displacement, RMS to ours", percent(read.point_data["displacement_mm"], ours), 1e-5, "%")
+            yield Row(
+                "meshio",
+                f"{name}: displacement, RMS to ours",
+                percent(read.point_data["displacement_mm"], ours),
+                1e-5,
+                "%",
+            )
         if name == "vtu":
             continue
+        if name == "gmsh":
+            counts = {key: sum(len(ids) for ids in sets if ids is not None) for key, sets in read.cell_sets.items()}
+            expected = {group.name: len(group.triangles) for group in face_groups(mesh)}
+            wrong = sum(counts.get(key) != count for key, count in expected.items())
+            yield Row("meshio", "gmsh: groups of faces with lost or gained ones", wrong, 0)
         plain = {tissue: tissue.upper() if name == "abaqus" else tissue for tissue in volumes_of(mesh)}
-        own = {tissue: [(block, read.cell_sets[key][number]) for number, block in blocks] for tissue, key in plain.items()}
+        own = {
+            tissue: [(block, read.cell_sets[key][number]) for number, block in blocks] for tissue, key in plain.items()
+        }
         sizes = {
-            tissue: sum(tetrahedra(read.points, block.data[ids]) for block, ids in parts if ids is not None and len(ids))
+            tissue: sum(
+                tetrahedra(read.points, block.data[ids]) for block, ids in parts if ids is not None and len(ids)
+            )
             for tissue, parts in own.items()
         }
         yield Row("meshio", f"{name}: volume of a tissue, relative difference", worst_volume(sizes, mesh), VOLUME)
@@ -139,8 +168,12 @@ def dolfinx(results: Results, folder: Path) -> Iterator[Row]:
         return
     meshio, mesh = importlib.import_module("meshio"), result.space.mesh
     read = meshio.read(path)
-    tags = [data for block, data in zip(read.cells, read.cell_data["gmsh:physical"], strict=True) if block.type == "tetra10"]
-    tets = meshio.Mesh(read.points, [("tetra10", read.cells_dict["tetra10"])], cell_data={"tissue": [np.concatenate(tags)]})
+    tags = [
+        data for block, data in zip(read.cells, read.cell_data["gmsh:physical"], strict=True) if block.type == "tetra10"
+    ]
+    tets = meshio.Mesh(
+        read.points, [("tetra10", read.cells_dict["tetra10"])], cell_data={"tissue": [np.concatenate(tags)]}
+    )
     meshio.write(folder / "dolfinx" / "palpate.xdmf", tets)
     script = Path(__file__).with_name("export_dolfinx.py")
     printed = ran([SYSTEM, script, path, folder / "dolfinx" / "palpate.xdmf"], folder)
@@ -149,8 +182,15 @@ def dolfinx(results: Results, folder: Path) -> Iterator[Row]:
     for way in ("gmshio", "xdmf"):
         lost = abs(found[way]["nodes"] - len(result.space.points)) + abs(found[way]["cells"] - len(mesh.tets))
         yield Row(part, f"{way}: nodes and cells lost or gained", lost, 0)
-        yield Row(part, f"{way}: volume of a tissue, relative difference", worst_volume(found[way]["volumes"], mesh), VOLUME)
-    yield Row(part, "faces whose group is not the smallest one that they are in", different(found["faces"], first_groups(result)), 0)
+        yield Row(
+            part, f"{way}: volume of a tissue, relative difference", worst_volume(found[way]["volumes"], mesh), VOLUME
+        )
+    yield Row(
+        part,
+        "faces whose group is not the smallest one that they are in",
+        different(found["faces"], first_groups(result)),
+        0,
+    )
 
 
 def first_groups(result: palpate.CaseResult) -> dict[str, int]:

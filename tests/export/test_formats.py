@@ -150,7 +150,7 @@ OBLIQUE = Rotation.from_rotvec(np.radians(37.0) * np.array([1.0, 2.0, 3.0]) / np
 
 @pytest.mark.parametrize("mirror", [[0, 1, 2], [1, 0, 2]])  # the axes of an image may be left-handed
 def test_loads_on_what_slides_askew_are_stated_along_its_axes(case_result, tmp_path, mirror):
-    """Abaqus and CalculiX take *CLOAD along the axes of *TRANSFORM: a x, (a x b) x a, a x b of the two that are given."""
+    """Abaqus and CalculiX take *CLOAD along the axes of *TRANSFORM: a, (a x b) x a and a x b of the two given."""
     loads = (
         CaseLoad("gravity", acceleration_m_s2=(0.0, -9.81, 0.0)),
         CaseLoad("traction", surface="outer", traction_kpa=(0.2, 0.5, -0.3)),
@@ -553,7 +553,9 @@ def test_each_later_image_bears_its_own_loads(model, tmp_path):
     abaqus.write(model, body, tmp_path)
     first, second = (tmp_path / "palpate.inp").read_text().split("*STEP")[1:]
     assert "OP=NEW" not in first + second  # CalculiX takes away at once what that leaves out, and may find no way on
-    stated = [re.findall(r"^(\d+), ([123]), (\S+)$", step.split("*CLOAD\n")[1], re.MULTILINE) for step in (first, second)]
+    stated = [
+        re.findall(r"^(\d+), ([123]), (\S+)$", step.split("*CLOAD\n")[1], re.MULTILINE) for step in (first, second)
+    ]
     assert [row[:2] for row in stated[0]] == [row[:2] for row in stated[1]]
     assert {row[2] for row in stated[1]} == {"0"} != {row[2] for row in stated[0]}
     assert second.count(", P") == first.count(", P") > 0

@@ -2,8 +2,8 @@
 
 Keywords: Abaqus Analysis User's Guide; CalculiX CrunchiX User's Manual 2.20, chapter 7 (which takes the same file). The
 hyperelastic laws of both are decoupled, W = C10 (J^(-2/3) I1 - 3) + C01 (J^(-4/3) I2 - 3) + (J - 1)^2 / D1, ours are
-not: C10, C01 and D1 = 2 / K give the same moduli at small strain, mu and K, and docs/export.md the difference. Both take
-the forces on a node with a *TRANSFORM along the axes of that, as they do what holds it, and pressures as ever.
+not: C10, C01 and D1 = 2 / K give the same moduli at small strain, mu and K, and docs/export.md the difference. Both
+take what holds and loads a node with a *TRANSFORM along its axes; GLOBAL=YES prints along those of the world.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[s
 
 
 def _summed(space: LagrangeSpace, loads: tuple[Load, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Forces on the nodes (n_points, 3) mN of what stays as it is, pressures on faces (n_tets, 4) kPa of what follows."""
+    """Forces on the nodes (n_points, 3) mN of loads that stay, pressures on faces (n_tets, 4) kPa of the others."""
     forces, pressure = np.zeros_like(space.points), np.zeros((len(space.mesh.tets), 4))
     for load in loads:
         if isinstance(load, FollowingPressure):

@@ -125,7 +125,7 @@ def _map(highdicom: Any, slices: list[Dataset], volume: Any, model: FittedModel,
 
 
 def _with_anatomy(found: Dataset) -> Dataset:
-    """With the frame anatomy that PS3.3 A.75.5 demands and highdicom leaves out: of the body, which is no paired part."""
+    """With the frame anatomy that PS3.3 A.75.5 demands and highdicom leaves out: the body, which is no paired part."""
     sequence = import_module("pydicom").Sequence
     anatomy, region = type(found.SharedFunctionalGroupsSequence[0])(), import_module("highdicom").sr.CodedConcept
     anatomy.AnatomicRegionSequence = sequence([region("38266002", "SCT", "Entire body")])

@@ -2,8 +2,8 @@
 
 ITK's convention: a transform takes points of the fixed image to the moving one, T(x) = x + d(x), LPS mm. `warp` takes
 the points of `before` to `after`; as a resampling transform it brings the image `after` onto the grid of `before`.
-`inverse_warp` is the other way round. Programs that take derivatives along the grid for those along the world's axes find
-the right Jacobian of a field on an image that lies straight, whichever way its axes lead (docs/export.md).
+`inverse_warp` is the other way round. The grid's axes lead as LPS does: programs that take derivatives along the grid
+for those in the world find the right Jacobian on every image that lies straight (docs/export.md).
 """
 
 from __future__ import annotations

@@ -105,7 +105,8 @@ def _refuse_unsymmetric(matrix: sparse.csr_matrix[np.float64]) -> None:
         )
     drawn = np.random.default_rng(0).uniform(-1.0, 1.0, n)
     with np.errstate(invalid="ignore"):  # what is not finite has no positive pivot
-        beyond = np.abs(matrix @ drawn - matrix.T @ drawn) - SYMMETRIC * (abs(matrix) @ np.abs(drawn))
+        off = np.abs(np.asarray(matrix @ drawn) - np.asarray(matrix.T @ drawn))
+        beyond = off - SYMMETRIC * np.asarray(abs(matrix) @ np.abs(drawn))
     if beyond.max() > 0.0:
         raise ValueError(
             f"the matrix of {n} unknowns is not symmetric: row and column {int(np.argmax(beyond))} differ; this solver"
