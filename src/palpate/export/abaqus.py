@@ -91,9 +91,9 @@ def _text(model: FittedModel, body: FittedBody, space: LagrangeSpace, element: s
 def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[str]:
     """A step a later image: walls, bones and the cut of the image where the fit has them, and the known loads.
 
-    Each node and face is loaded once; what acted in the step before is stated too, and goes evenly to what it is now.
+    Each node and face is loaded once in a step.
     """
-    held, acting = prescribed(body, space, outer=model.outer_boundary), _summed(space, ())
+    held = prescribed(body, space, outer=model.outer_boundary)
     parts = []
     if not held.along_world:
         parts += ["*NSET, NSET=SLIDING\n", wrapped(held.sliding + 1), "*TRANSFORM, NSET=SLIDING, TYPE=R\n"]
@@ -108,14 +108,15 @@ def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[s
             parts += [rows("%d, %d, %d, %.12g", held.whole + 1, along, along, displacement[held.whole, axis])]
             still = held.sliding[held.held[:, axis]] + 1
             parts += [rows("%d, %d, %d", still, np.full(len(still), axis + 1), np.full(len(still), axis + 1))]
-        loads = loads_on(space, body.loads[number - 1], densities=model.densities)
-        acting, before = _summed(space, loads), acting
-        acting[0][held.sliding] = acting[0][held.sliding] @ held.axes.T
-        stated = [np.nonzero((now != 0.0) | (then != 0.0)) for now, then in zip(acting, before, strict=True)]
-        points, axes = stated[0]
-        cells, faces = stated[1]
-        parts += ["*CLOAD\n" * (len(points) > 0), rows("%d, %d, %.12g", points + 1, axes + 1, acting[0][stated[0]])]
-        parts += ["*DLOAD\n" * (len(cells) > 0), rows("%d, P%d, %.12g", cells + 1, FACE[faces], acting[1][stated[1]])]
+        forces, pressure = _summed(space, loads_on(space, body.loads[number - 1], densities=model.densities))
+        forces[held.sliding] = forces[held.sliding] @ held.axes.T
+        points, axes = np.nonzero(forces)
+        cells, faces = np.nonzero(pressure)
+        new = ", OP=NEW" if any(body.loads[: number - 1]) else ""  # what acted before does not stay
+        if new or len(points):
+            parts += [f"*CLOAD{new}\n", rows("%d, %d, %.12g", points + 1, axes + 1, forces[points, axes])]
+        if new or len(cells):
+            parts += [f"*DLOAD{new}\n", rows("%d, P%d, %.12g", cells + 1, FACE[faces], pressure[cells, faces])]
         outputs = "*NODE PRINT, NSET=ALL_NODES, GLOBAL=YES\nU, RF\n*NODE FILE, GLOBAL=YES\nU, RF\n*END STEP\n"
         parts.append(outputs)
     return parts
