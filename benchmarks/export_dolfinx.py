@@ -12,12 +12,12 @@ import numpy as np
 
 def main() -> None:
     """Read both files that are named and tell of them."""
-    gmsh, dolfinx, io = import_module("gmsh"), import_module("dolfinx"), import_module("dolfinx.io")
+    gmsh, dolfinx, io = (import_module(name) for name in ("gmsh", "dolfinx", "dolfinx.io"))
     world = import_module("mpi4py.MPI").COMM_WORLD
     gmsh.initialize()
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.open(sys.argv[1])
-    mesh, cells, faces = io.gmshio.model_to_mesh(gmsh.model, world, 0, 3)
+    mesh, cells, faces = import_module("dolfinx.io.gmshio").model_to_mesh(gmsh.model, world, 0, 3)
     names = {group: gmsh.model.getPhysicalName(*group) for group in gmsh.model.getPhysicalGroups()}
     tissues = {tag: name for (dimension, tag), name in names.items() if dimension == 3}
     counts = {name: len(faces.find(tag)) for (dimension, tag), name in names.items() if dimension == 2}
