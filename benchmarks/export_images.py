@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import nibabel
 import numpy as np
-from export_rows import LPS, Results, Row, any_of, beside_python, missing, ran
+from export_rows import LPS, Results, Row, any_of, installed, missing, ran
 from numpy.typing import NDArray
 
 import palpate
@@ -114,8 +115,8 @@ def of_tissue(result: palpate.CaseResult, name: str) -> NDArray[np.bool_]:
 
 def by_dcmqi(result: palpate.CaseResult, place: Path, kind: str, names: dict[int, str]) -> Iterator[Row]:
     """Both objects as dcmqi's converters turn them into NIfTI, voxel by voxel at its place in our image."""
-    program, other = beside_python("paramap2itkimage"), beside_python("segimage2itkimage")
-    if program is None or other is None:
+    program, other = (Path(sys.executable).parent / name for name in ("paramap2itkimage", "segimage2itkimage"))
+    if installed("dcmqi") is None:
         yield from missing("dcmqi", f"{kind}: values and places")
         return
     ran([program, "--inputDICOM", place / "stiffness.dcm", "--outputDirectory", place, "-t", "nii"], place)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,9 +92,3 @@ def ran(command: Sequence[str | Path], folder: Path) -> str:
     if done.returncode:
         raise RuntimeError(f"{command[0]} ended with {done.returncode}: {(done.stdout + done.stderr)[-2000:]}")
     return done.stdout + done.stderr
-
-
-def beside_python(name: str) -> Path | None:
-    """A program that a package of this environment brings; None where there is none."""
-    path = Path(sys.executable).parent / name
-    return path if path.exists() else None

@@ -149,7 +149,7 @@ def _mesh(mesh: Element, body: FittedBody, space: LagrangeSpace, loads: tuple[Lo
 def _node_sets(
     mesh: Element, body: FittedBody, space: LagrangeSpace, held: Prescribed, loads: tuple[Load, ...]
 ) -> None:
-    """The nodes of every group and load, and those that are held; after the sets of elements, as pyfebio orders them."""
+    """The nodes of every group and load, and those that are held; after sets of elements, as pyfebio has it."""
     for group in face_groups(body.mesh):
         _node_set(mesh, f"{group.name} nodes", np.unique(space.facets(group.triangles)))
     for number, load in enumerate(loads, start=1):
