@@ -13,10 +13,12 @@ from xml.etree import ElementTree as ET
 
 import highdicom
 import meshio
+import nibabel
 import numpy as np
 import pydicom
 import pytest
 import SimpleITK
+from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 import palpate
@@ -35,6 +37,7 @@ from palpate.mesh.space import lagrange_space
 from palpate.mesh.surface import triangle_normals
 from palpate.mesh.tet_mesh import FACES
 from palpate.study.case import CaseLoad
+from palpate.study.case_loads import loads_on
 
 VOLUME = 1e-4  # relative
 LPS = np.array([-1.0, -1.0, 1.0])
@@ -131,10 +134,56 @@ def test_the_elements_of_abaqus_are_ours_edge_by_edge(exported):
         np.testing.assert_allclose(mesh.points[tets[:, place]], mesh.points[tets[:, [a, b]]].mean(axis=1), atol=1e-9)
 
 
+def sliding(result, turn):
+    """The result with a cut that slides, turned in space, image and mesh, by a matrix (3, 3)."""
+    domain = dataclasses.replace(result.case.domain, outer_boundary="sliding")
+    case = dataclasses.replace(result.case, domain=domain)
+    grid, mesh = result.before.grid, dataclasses.replace(result.space.mesh, nodes=result.space.mesh.nodes @ turn.T)
+    turned = np.eye(4)
+    turned[:3, :3] = turn
+    before = dataclasses.replace(result.before, grid=dataclasses.replace(grid, affine=turned @ grid.affine))
+    return dataclasses.replace(result, case=case, space=lagrange_space(mesh, "P2"), before=before)
+
+
+OBLIQUE = Rotation.from_rotvec(np.radians(37.0) * np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0)).as_matrix()
+
+
+@pytest.mark.parametrize("mirror", [[0, 1, 2], [1, 0, 2]])  # the axes of an image may be left-handed
+def test_loads_on_what_slides_askew_are_stated_along_its_axes(case_result, tmp_path, mirror):
+    """Abaqus and CalculiX take *CLOAD along the axes of *TRANSFORM: a, (a x b) x a and a x b of the two given."""
+    loads = (
+        CaseLoad("gravity", acceleration_m_s2=(0.0, -9.81, 0.0)),
+        CaseLoad("traction", surface="outer", traction_kpa=(0.2, 0.5, -0.3)),
+        CaseLoad("pressure", surface="outer", pressure_kpa=2.0, following=False),
+        CaseLoad("pressure", surface="outer", pressure_kpa=1.0),
+        CaseLoad("pressure", surface="outer", pressure_kpa=0.5),
+    )
+    result = with_mechanics(sliding(case_result, OBLIQUE), "neo-hookean", loads)
+    grid = result.before.grid
+    swapped = VoxelGrid(tuple(np.array(grid.shape)[mirror].tolist()), grid.affine[:, [*mirror, 3]])
+    before = dataclasses.replace(result.before, grid=swapped, index=result.before.index.transpose(mirror))
+    palpate.export(dataclasses.replace(result, before=before), tmp_path, format="abaqus")
+    text = (tmp_path / "palpate.inp").read_text()
+    first, second = np.array([float(x) for x in text.split("TYPE=R\n")[1].splitlines()[0].split(",")]).reshape(2, 3)
+    along = np.array([first, np.cross(np.cross(first, second), first), np.cross(first, second)])
+    found = np.zeros_like(result.space.points)
+    for row in text.split("*CLOAD\n")[1].split("*")[0].splitlines():
+        node, axis, force = row.split(",")
+        found[int(node) - 1, int(axis) - 1] += float(force)
+    nodes = text.split("NSET=SLIDING\n")[1].split("*")[0].replace(",", " ").split()
+    turned = np.array([int(node) - 1 for node in nodes])
+    assert len(turned) > 1000
+    found[turned] = found[turned] @ along
+    acting = loads_on(result.space, loads, densities=np.full(4, 1000.0))
+    expected = sum(load.forces(np.zeros_like(found)) for load in acting[:3]).reshape(-1, 3)
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+    assert set(re.findall(r"^\d+, P\d, (\S+)$", text, re.MULTILINE)) == {"1.5"}  # each face once
+    assert "GLOBAL=YES\nU, RF\n*NODE FILE, GLOBAL=YES" in text
+
+
 def test_sliding_faces_are_held_along_their_normals(case_result, tmp_path):
     """In Abaqus along the image's own axes; where these are askew, FEBio and SOFA say that they cannot."""
-    domain = dataclasses.replace(case_result.case.domain, outer_boundary="sliding")
-    result = dataclasses.replace(case_result, case=dataclasses.replace(case_result.case, domain=domain))
+    result = sliding(case_result, np.eye(3))
     palpate.export(result, tmp_path / "straight", format="abaqus", linear=True)
     text = (tmp_path / "straight" / "palpate.inp").read_text()
     held = re.findall(r"^(\d+), ([123]), \2$", text, re.MULTILINE)
@@ -143,17 +192,11 @@ def test_sliding_faces_are_held_along_their_normals(case_result, tmp_path):
     for node, axis in list(low)[::20]:
         assert mesh.nodes[node, axis] in (0.0, 40.0)
     assert "*TRANSFORM" not in text
-    turn = np.eye(4)
-    turn[:2, :2] = [[0.8, -0.6], [0.6, 0.8]]
-    mesh = dataclasses.replace(mesh, nodes=mesh.nodes @ turn[:3, :3].T)
-    grid = dataclasses.replace(result.before.grid, affine=turn @ result.before.grid.affine)
-    space = lagrange_space(mesh, "P2")
-    before = dataclasses.replace(result.before, grid=grid)
-    askew = dataclasses.replace(result, space=space, before=before)
+    askew = sliding(case_result, OBLIQUE)
     palpate.export(askew, tmp_path / "askew", format="abaqus", linear=True)
     lines = (tmp_path / "askew" / "palpate.inp").read_text().split("TYPE=R\n")[1].splitlines()
     axes = np.array([float(x) for x in lines[0].split(",")]).reshape(2, 3)
-    np.testing.assert_allclose(np.abs(axes @ turn[:3, :3]), np.eye(3)[:2], atol=1e-9)
+    np.testing.assert_allclose(np.abs(axes @ OBLIQUE), np.eye(3)[:2], atol=1e-9)
     for name in ("febio", "sofa"):
         with pytest.raises(ConfigurationError, match="askew"):
             palpate.export(askew, tmp_path / name, format=name)
@@ -267,6 +310,27 @@ def test_the_warp_takes_points_to_where_the_model_has_them(case_result, tmp_path
         assert np.sqrt(((found - goal[near]) ** 2).sum(axis=1).mean()) < 0.05
 
 
+@pytest.mark.parametrize("axes", ["RAS", "PIR"])
+def test_the_jacobian_of_a_warp_is_the_models_however_the_axes_of_the_image_lead(case_result, tmp_path, model, axes):
+    """SimpleITK takes derivatives along the grid for those along LPS; most images lead RAS. Here: change of volume."""
+    before = case_result.before
+    turn = nibabel.orientations.axcodes2ornt(axes)
+    index = nibabel.orientations.apply_orientation(before.index, turn)
+    affine = before.grid.affine @ nibabel.orientations.inv_ornt_aff(turn, before.grid.shape)
+    turned = dataclasses.replace(before, index=index, grid=VoxelGrid(index.shape, affine))
+    palpate.export(dataclasses.replace(case_result, before=turned), tmp_path, format="warp")
+    field = SimpleITK.ReadImage(str(tmp_path / "warp.nii.gz"), SimpleITK.sitkVectorFloat64)
+    found = SimpleITK.DisplacementFieldJacobianDeterminant(field)
+    body, name = model.bodies[0], "bladder"
+    own = body.mesh.tets[body.mesh.region == body.mesh.tissue_index(name)]
+    deep = body.mesh.nodes[own].mean(axis=1)
+    values = [found[found.TransformPhysicalPointToIndex(place)] for place in (deep * LPS).tolist()]
+    moved = (body.mesh.nodes + fitted_motion(model, linear=True))[own]
+    changes = np.linalg.det(moved[:, 1:] - moved[:, :1]) / np.linalg.det(np.diff(body.mesh.nodes[own], axis=1))
+    assert np.ptp(changes) > 0.02
+    assert np.sqrt(np.mean((np.array(values) - changes) ** 2)) < 0.01
+
+
 def test_dicom_holds_stiffness_in_kilopascals_and_every_tissue(exported, case_result):
     folder = exported("dicom")
     stiffness = pydicom.dcmread(folder / "stiffness.dcm")
@@ -316,6 +380,13 @@ def test_frames_of_dicom_lie_as_the_slices_of_the_series_and_without_one_axial(c
     for name, least in (("stiffness.dcm", 58.0), ("segmentation.dcm", 0.5)):
         found = highdicom.imread(tmp_path / "out" / name)
         groups = found.SharedFunctionalGroupsSequence[0]
+        if name == "stiffness.dcm":  # from the lowest slice up, as dcmqi takes them to lie
+            assert groups.FrameAnatomySequence[0].FrameLaterality == "U"
+            frames = found.PerFrameFunctionalGroupsSequence
+            normal = np.cross(*np.reshape(groups.PlaneOrientationSequence[0].ImageOrientationPatient, (2, 3)))
+            assert (np.diff([f.PlanePositionSequence[0].ImagePositionPatient @ normal for f in frames]) > 0.0).all()
+            places = [int(f.FrameContentSequence[0].DimensionIndexValues) for f in frames]
+            assert places == list(range(1, len(frames) + 1))
         rows_and_columns = groups.PlaneOrientationSequence[0].ImageOrientationPatient
         np.testing.assert_allclose(rows_and_columns, np.ravel(TILTED[plane or "axial"]), atol=1e-6)
         volume = (
@@ -483,7 +554,8 @@ def test_each_later_image_bears_its_own_loads(model, tmp_path):
     first, second = (tmp_path / "palpate.inp").read_text().split("*STEP")[1:]
     assert "*CLOAD\n" in first
     assert "*DLOAD\n" in first
-    assert "*CLOAD, OP=NEW\n*DLOAD, OP=NEW\n*DLOAD, OP=NEW\n" in second
+    assert "*CLOAD, OP=NEW\n*DLOAD, OP=NEW\n" in second
+    assert second.count(", P") == first.count(", P") > 0
 
 
 @pytest.mark.parametrize("name", ["abaqus", "febio", "sofa"])

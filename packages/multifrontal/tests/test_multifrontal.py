@@ -159,6 +159,39 @@ def test_an_indefinite_matrix_is_refused_with_its_pivot(body, dtype, threads):
     assert 0 < refused.value.pivot <= body.shape[0]
 
 
+def row_of_springs(n):
+    """Held at one end: a force of 1 at the other moves that by n."""
+    stiff = np.append(np.full(n - 1, 2.0), 1.0)
+    return sparse.csr_matrix(sparse.diags_array([stiff, -np.ones(n - 1), -np.ones(n - 1)], offsets=[0, 1, -1]))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("coupling", [1.0, 1e-6])
+@pytest.mark.parametrize("part", [sparse.tril, sparse.triu])
+def test_one_triangle_alone_is_refused_however_weak_its_couplings(part, coupling, dtype):
+    """Else a row of 20 springs would give 3 or 1 for 20, as the triangle is the lower or the upper one."""
+    springs, end = row_of_springs(20), np.eye(20)[-1]
+    assert multifrontal.factorise(springs).solve(end)[-1] == pytest.approx(20.0, rel=1e-12)
+    diagonal = sparse.diags_array(springs.diagonal())
+    one = sparse.csr_matrix(diagonal + coupling * (part(springs) - diagonal))
+    for plan_of_it in (None, multifrontal.analyse(one)):
+        with pytest.raises(ValueError, match="one triangle alone of the matrix of 20 unknowns"):
+            multifrontal.factorise(one, dtype=dtype, plan=plan_of_it)
+
+
+def test_a_matrix_whose_triangles_differ_is_refused(body):
+    """Zeros stored in one triangle, one entry that its mirror image has not, another sign: none is symmetric."""
+    zeros, lost, turned = body.copy(), body.tolil(), body.tolil()
+    zeros.data[body.indices > np.repeat(np.arange(body.shape[0]), np.diff(body.indptr))] = 0.0
+    row = 100
+    column = int(np.argmax(np.abs(body[[row]].toarray()[0, :row])))
+    lost[row, column] = 0.0
+    turned[row, column] *= -1.0
+    for matrix in (zeros, sparse.csr_matrix(lost), sparse.csr_matrix(turned)):
+        with pytest.raises(ValueError, match="of 1029 unknowns is not symmetric: row and column"):
+            multifrontal.factorise(matrix)
+
+
 def test_one_pattern_is_analysed_once(body):
     first = multifrontal.analyse(body)
     assert multifrontal.analyse(2.0 * body) is first

@@ -2,7 +2,8 @@
 
 Keywords: Abaqus Analysis User's Guide; CalculiX CrunchiX User's Manual 2.20, chapter 7 (which takes the same file). The
 hyperelastic laws of both are decoupled, W = C10 (J^(-2/3) I1 - 3) + C01 (J^(-4/3) I2 - 3) + (J - 1)^2 / D1, ours are
-not: C10, C01 and D1 = 2 / K give the same moduli at small strain, mu and K, and docs/export.md the difference.
+not: C10, C01 and D1 = 2 / K give the same moduli at small strain, mu and K, and docs/export.md the difference. Both
+take what holds and loads a node with a *TRANSFORM along its axes; GLOBAL=YES prints along those of the world.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.export.conditions import prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
@@ -26,14 +28,14 @@ from palpate.export.groups import (
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
-from palpate.mechanics.loads import FollowingPressure
+from palpate.mechanics.loads import FollowingPressure, Load
 from palpate.mesh.space import LagrangeSpace
 from palpate.study.case_loads import loads_on
 from palpate.study.outputs import write_text
 
 FACE = np.array([3, 4, 2, 1])  # Abaqus' number of each row of FACES
 LAWS = (Linear, NeoHookean, MooneyRivlin)  # that it has
-INCREMENT = 0.2  # of a step at finite strain, at first
+INCREMENT, LEAST = 0.2, 1e-6  # of a step at finite strain, at first and at the least
 
 
 def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
@@ -89,7 +91,7 @@ def _text(model: FittedModel, body: FittedBody, space: LagrangeSpace, element: s
 def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[str]:
     """A step a later image: walls, bones and the cut of the image where the fit has them, and the known loads.
 
-    A pressure that follows its surface acts on the elements' faces; other loads are their forces on the nodes, mN.
+    Each node and face is loaded once in a step.
     """
     held = prescribed(body, space, outer=model.outer_boundary)
     parts = []
@@ -98,7 +100,7 @@ def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[s
         parts += [", ".join(f"{x:.12g}" for x in held.axes[:2].ravel()) + "\n"]
     finite = model.material_law.finite
     for number, displacement in enumerate(body.displacements, start=1):
-        increments = f"{INCREMENT:g}, 1.\n" if finite else ""
+        increments = f"{INCREMENT:g}, 1., {LEAST:g}\n" if finite else ""
         parts += [f"** later image {number}\n*STEP{', NLGEOM, INC=1000' if finite else ''}\n*STATIC\n{increments}"]
         parts += ["*BOUNDARY\n"]
         for axis in range(3):
@@ -106,17 +108,26 @@ def _steps(model: FittedModel, body: FittedBody, space: LagrangeSpace) -> list[s
             parts += [rows("%d, %d, %d, %.12g", held.whole + 1, along, along, displacement[held.whole, axis])]
             still = held.sliding[held.held[:, axis]] + 1
             parts += [rows("%d, %d, %d", still, np.full(len(still), axis + 1), np.full(len(still), axis + 1))]
-        if any(body.loads[: number - 1]):  # what acted in the step before does not stay
-            parts += ["*CLOAD, OP=NEW\n*DLOAD, OP=NEW\n"]
-        new = ", OP=NEW" if number > 1 else ""
-        for load in loads_on(space, body.loads[number - 1], densities=model.densities):
-            if isinstance(load, FollowingPressure):
-                cells, faces = element_faces(body.mesh, load.faces[:, :3])
-                pressures = np.full(len(cells), load.kilopascal)
-                parts += [f"*DLOAD{new}\n", rows("%d, P%d, %.12g", cells + 1, FACE[faces], pressures)]
-            else:
-                forces = load.forces(np.zeros_like(space.points)).reshape(-1, 3)
-                points, axes = np.nonzero(forces)
-                parts += [f"*CLOAD{new}\n", rows("%d, %d, %.12g", points + 1, axes + 1, forces[points, axes])]
-        parts += ["*NODE PRINT, NSET=ALL_NODES\nU\n*NODE FILE\nU\n*END STEP\n"]
+        forces, pressure = _summed(space, loads_on(space, body.loads[number - 1], densities=model.densities))
+        forces[held.sliding] = forces[held.sliding] @ held.axes.T
+        points, axes = np.nonzero(forces)
+        cells, faces = np.nonzero(pressure)
+        new = ", OP=NEW" if any(body.loads[: number - 1]) else ""  # what acted before does not stay
+        if new or len(points):
+            parts += [f"*CLOAD{new}\n", rows("%d, %d, %.12g", points + 1, axes + 1, forces[points, axes])]
+        if new or len(cells):
+            parts += [f"*DLOAD{new}\n", rows("%d, P%d, %.12g", cells + 1, FACE[faces], pressure[cells, faces])]
+        outputs = "*NODE PRINT, NSET=ALL_NODES, GLOBAL=YES\nU, RF\n*NODE FILE, GLOBAL=YES\nU, RF\n*END STEP\n"
+        parts.append(outputs)
     return parts
+
+
+def _summed(space: LagrangeSpace, loads: tuple[Load, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Forces on the nodes (n_points, 3) mN of loads that stay, pressures on faces (n_tets, 4) kPa of the others."""
+    forces, pressure = np.zeros_like(space.points), np.zeros((len(space.mesh.tets), 4))
+    for load in loads:
+        if isinstance(load, FollowingPressure):
+            np.add.at(pressure, element_faces(space.mesh, load.faces[:, :3]), load.kilopascal)
+        else:
+            forces += load.forces(np.zeros_like(forces)).reshape(-1, 3)
+    return forces, pressure

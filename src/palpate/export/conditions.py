@@ -22,8 +22,8 @@ class Prescribed:
     """Points that are held or moved.
 
     whole (n,): points whose displacement is that of the fit along all axes; sliding (m,): points that keep to a face,
-    an edge or a corner of the image, held (m, 3) marks along which rows of `axes` (3, 3), unit vectors, they do not
-    move.
+    an edge or a corner of the image, held (m, 3) marks along which rows of `axes` (3, 3), right-handed unit vectors,
+    they do not move.
     """
 
     whole: NDArray[np.int64]
@@ -51,6 +51,7 @@ def prescribed(body: FittedBody, space: LagrangeSpace, *, outer: str) -> Prescri
     sizes = np.abs(axes)
     if np.all(np.minimum(sizes, 1.0 - sizes) < IN_FRAME):  # the world's axes, maybe reordered
         axes = np.eye(3)
+    axes[2] = np.cross(axes[0], axes[1])  # an image may be left-handed
     rows, free = constraint.free.tocsr(), np.empty((len(space.points), 3))
     for place, axis in enumerate(axes):  # the square of what of it lies among each point's free directions, 0 or 1
         blocks = sparse.kron(sparse.eye_array(len(space.points)), axis[None]).tocsr() @ rows

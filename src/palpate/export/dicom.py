@@ -121,6 +121,33 @@ def _map(highdicom: Any, slices: list[Dataset], volume: Any, model: FittedModel,
         **common,
     )
     found.SeriesDescription = f"Young's modulus ({unit.value}), Palpate"
+    return _upwards(_with_anatomy(found))
+
+
+def _with_anatomy(found: Dataset) -> Dataset:
+    """With the frame anatomy that PS3.3 A.75.5 demands and highdicom leaves out: the body, which is no paired part."""
+    sequence = import_module("pydicom").Sequence
+    anatomy, region = type(found.SharedFunctionalGroupsSequence[0])(), import_module("highdicom").sr.CodedConcept
+    anatomy.AnatomicRegionSequence = sequence([region("38266002", "SCT", "Entire body")])
+    anatomy.FrameLaterality = "U"
+    found.SharedFunctionalGroupsSequence[0].FrameAnatomySequence = sequence([anatomy])
+    return found
+
+
+def _upwards(found: Dataset) -> Dataset:
+    """With its frames along the normal of their rows and columns, the order in which dcmqi takes them to lie.
+
+    highdicom stores them the other way round.
+    """
+    frames = list(found.PerFrameFunctionalGroupsSequence)
+    turned = found.SharedFunctionalGroupsSequence[0].PlaneOrientationSequence[0].ImageOrientationPatient
+    normal = np.cross(*np.reshape(np.array(turned, dtype=float), (2, 3)))
+    order = np.argsort([normal @ np.array(f.PlanePositionSequence[0].ImagePositionPatient, float) for f in frames])
+    for place, frame in enumerate(order.tolist(), start=1):
+        frames[frame].FrameContentSequence[0].DimensionIndexValues = [place]
+    found.PerFrameFunctionalGroupsSequence = [frames[frame] for frame in order]
+    pixels = np.frombuffer(found.FloatPixelData, dtype="<f4").reshape(len(frames), -1)
+    found.FloatPixelData = pixels[order].tobytes()
     return found
 
 

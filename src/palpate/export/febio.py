@@ -50,12 +50,13 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     groups = enumerate(tissue_groups(body.mesh).items(), start=1)
     maps = {name: (cells, _material(material, model, body, name, number)) for number, (name, cells) in groups}
     mesh = _add(root, "Mesh")
-    _mesh(mesh, body, space, held, loads)
+    _mesh(mesh, body, space, loads)
     domains = _add(root, "MeshDomains")
     for name in tissue_groups(body.mesh):
         _add(domains, "SolidDomain", name=name, mat=name)
     data = _add(root, "MeshData")
     _element_data(mesh, data, maps)
+    _node_sets(mesh, body, space, held, loads)
     curves = _add(root, "LoadData")
     if loads:
         _loads(data, _add(root, "Loads"), loads, len(space.points), first_curve=len(body.displacements) + 1)
@@ -127,8 +128,8 @@ def _element_data(
                 _add(values, "elem", f"{value:.12g}", lid=place)
 
 
-def _mesh(mesh: Element, body: FittedBody, space: LagrangeSpace, held: Prescribed, loads: tuple[Load, ...]) -> None:
-    """Nodes, elements by tissue, surfaces and node sets of every group, and the sets that are held."""
+def _mesh(mesh: Element, body: FittedBody, space: LagrangeSpace, loads: tuple[Load, ...]) -> None:
+    """Nodes, elements by tissue, and the surface of every group."""
     nodes = _add(mesh, "Nodes", name="all")
     for number, point in enumerate(space.points.tolist(), start=1):
         _add(nodes, "node", ",".join(f"{x:.12g}" for x in point), id=number)
@@ -143,8 +144,14 @@ def _mesh(mesh: Element, body: FittedBody, space: LagrangeSpace, held: Prescribe
         surface = _add(mesh, "Surface", name=name)
         for number, facet in enumerate(faces.tolist(), start=1):
             _add(surface, f"tri{len(facet)}", ",".join(str(p + 1) for p in facet), id=number)
-    for name, faces in facets.items():
-        _node_set(mesh, f"{name} nodes", np.unique(faces))
+
+
+def _node_sets(
+    mesh: Element, body: FittedBody, space: LagrangeSpace, held: Prescribed, loads: tuple[Load, ...]
+) -> None:
+    """The nodes of every group and load, and those that are held; after sets of elements, as pyfebio has it."""
+    for group in face_groups(body.mesh):
+        _node_set(mesh, f"{group.name} nodes", np.unique(space.facets(group.triangles)))
     for number, load in enumerate(loads, start=1):
         if not isinstance(load, FollowingPressure):
             _node_set(mesh, f"load {number}", np.arange(len(space.points)))

@@ -67,8 +67,11 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
 
 
 def _surfaces(body: FittedBody) -> tuple[list[tuple[tuple[int, ...], NDArray[np.int64]]], list[str]]:
-    """Faces (n, 3) by the tags of all the groups that they belong to, and the groups' names, tag by tag from 1."""
-    groups = face_groups(body.mesh)
+    """Faces (n, 3) by the tags of all the groups that they belong to, and the groups' names, tag by tag from 1.
+
+    The smallest group has the lowest tag: dolfinx keeps that one of a face.
+    """
+    groups = sorted(face_groups(body.mesh), key=lambda group: len(group.triangles))
     triangles = np.concatenate([group.triangles for group in groups])
     keys = np.sort(triangles, axis=1)
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)

@@ -2,7 +2,8 @@
 
 ITK's convention: a transform takes points of the fixed image to the moving one, T(x) = x + d(x), LPS mm. `warp` takes
 the points of `before` to `after`; as a resampling transform it brings the image `after` onto the grid of `before`.
-`inverse_warp` is the other way round.
+`inverse_warp` is the other way round. The grid's axes lead as LPS does: programs that take derivatives along the grid
+for those in the world find the right Jacobian on every image that lies straight (docs/export.md).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import igl
 import numpy as np
+from nibabel.orientations import axcodes2ornt, inv_ornt_aff, io_orientation, ornt_transform
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -34,7 +36,10 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write warp.nii.gz, inverse_warp.nii.gz (numbered where there are several later images) and warp.json."""
     del model
     space, own = body.space, body.grid
-    # the same box with voxels of a millimetre at least
+    # the same box, its axes as near to LPS as they can be, with voxels of a millimetre at least
+    turn = ornt_transform(io_orientation(own.affine), axcodes2ornt("LPS"))
+    shape = np.array(own.shape)[np.argsort(turn[:, 0])]
+    own = VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), own.affine @ inv_ornt_aff(turn, own.shape))
     counts = np.maximum(np.minimum(own.shape, np.ceil(np.array(own.shape) * own.spacing / FINEST_MM)), 2).astype(int)
     steps = np.array(own.shape) / counts
     affine = np.array(own.affine)

@@ -18,6 +18,7 @@ from multifrontal.plan import Plan, make_plan
 __all__ = ["Factor", "analyse", "factorise"]
 
 KEPT_PLANS = 2  # of the patterns that came last
+SYMMETRIC = 1e-3  # by which a row and its column may differ, relative to the row: rounding cancels entries on one side
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +71,11 @@ def factorise(matrix: sparse.csr_matrix[np.float64], *, dtype: type = np.float64
     """The factor of the symmetric positive definite `matrix` (n, n), both of its triangles stored.
 
     dtype: np.float64, or np.float32 for half of the memory and nearly twice the speed; the largest entry is scaled to 1
-    then, for single precision has a small range. plan: that of its pattern, by `analyse`. Raises `NotPositiveDefinite`.
+    then, for single precision has a small range. plan: that of its pattern, by `analyse`. Raises `NotPositiveDefinite`,
+    and `ValueError` for a matrix that is not symmetric, as is one of which one triangle alone is stored.
     """
     canonical, scale = _canonical(matrix), 1.0
+    _refuse_unsymmetric(canonical)
     known, entries = analyse(canonical) if plan is None else plan, canonical.data
     if np.dtype(dtype) == np.float32:
         scale = float(np.abs(entries).max(initial=0.0)) or 1.0
@@ -89,3 +92,23 @@ def _canonical(matrix: sparse.csr_matrix[np.float64]) -> sparse.csr_matrix[np.fl
     copied = by_rows.copy()
     copied.sum_duplicates()
     return copied
+
+
+def _refuse_unsymmetric(matrix: sparse.csr_matrix[np.float64]) -> None:
+    """Raise `ValueError` where one triangle alone has entries, and where A x and A^T x differ for an x drawn by lot."""
+    n = matrix.shape[0]
+    places = matrix.indices - np.repeat(np.arange(n), np.diff(matrix.indptr))
+    if np.any(places < 0) != np.any(places > 0):
+        raise ValueError(
+            f"one triangle alone of the matrix of {n} unknowns is stored; store both: of a triangle T,"
+            " T + T.T - scipy.sparse.diags_array(T.diagonal())"
+        )
+    drawn = np.random.default_rng(0).uniform(-1.0, 1.0, n)
+    with np.errstate(invalid="ignore"):  # what is not finite has no positive pivot
+        off = np.abs(np.asarray(matrix @ drawn) - np.asarray(matrix.T @ drawn))
+        beyond = off - SYMMETRIC * np.asarray(abs(matrix) @ np.abs(drawn))
+    if beyond.max() > 0.0:
+        raise ValueError(
+            f"the matrix of {n} unknowns is not symmetric: row and column {int(np.argmax(beyond))} differ; this solver"
+            " takes the same entries in both triangles"
+        )
