@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 import palpate
-from palpate.export import fitted_bodies, material_parts
-from palpate.export.conditions import prescribed
+from palpate.export import fitted_bodies, material_parts, prescribed
 from palpate.mechanics import Dilatation, equilibrium
 from palpate.mesh import OUTER, Constraint
-from palpate.study.case_loads import loads_on
+from palpate.study import loads_on
 
 Array = NDArray[np.float64]
 

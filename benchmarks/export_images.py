@@ -14,10 +14,9 @@ from export_rows import LPS, Results, Row, any_of, installed, missing, ran
 from numpy.typing import NDArray
 
 import palpate
-from palpate.export.case_files import write_estimate_files
+from palpate.export import write_estimate_files
 from palpate.images import VoxelGrid
-from palpate.mesh import tissue_surface
-from palpate.mesh.locate import modulus_image
+from palpate.mesh import modulus_image, tissue_surface
 
 Array = NDArray[np.float64]
 

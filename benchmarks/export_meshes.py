@@ -28,8 +28,7 @@ from export_rows import (
 )
 
 import palpate
-from palpate.export import fitted_bodies
-from palpate.export.groups import face_groups
+from palpate.export import face_groups, fitted_bodies
 
 LONG = ("Nodes", "Elements", "Surface", "NodeData", "ElementData")  # lists of FEBio's
 SYSTEM = "/usr/bin/python3"  # for which Debian has dolfinx

@@ -36,9 +36,10 @@ from spoilt_cases import CASES, NAMES, override, spoilt_case, spoilt_table, toml
 from palpate.cli import main as palpate_command
 from palpate.errors import PalpateError
 from palpate.images import read_label_table
-from palpate.study import read_case, run
+from palpate.study import read_case
 
 importlib.import_module("palpate.study.check")  # before processes are forked that would import it each
+ESTIMATE = importlib.import_module("palpate.study.run")
 
 MEMORY_BYTES = 2 * 2**30
 MOST_FINDINGS = 20
@@ -148,7 +149,7 @@ def become_command(argv: list[str], said: int) -> None:
         sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
         resource.setrlimit(resource.RLIMIT_CPU, (COMMAND_SECONDS, COMMAND_SECONDS))
         warnings.simplefilter("default")
-        vars(run)["inverted"] = solving_begins
+        vars(ESTIMATE)["inverted"] = solving_begins
         try:
             code = palpate_command(argv)
         except SystemExit as stop:

@@ -12,7 +12,10 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any
 
+    from palpate.export.case_files import write_estimate_files as write_estimate_files
+    from palpate.export.conditions import prescribed as prescribed
     from palpate.export.fitted_model import fitted_bodies as fitted_bodies
+    from palpate.export.groups import face_groups as face_groups
     from palpate.export.groups import material_parts as material_parts
 
 

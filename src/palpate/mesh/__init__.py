@@ -7,6 +7,7 @@ from palpate.mesh.anatomy import anatomy_of as anatomy_of
 from palpate.mesh.anatomy import domain_box as domain_box
 from palpate.mesh.anatomy import margin_box as margin_box
 from palpate.mesh.locate import located as located
+from palpate.mesh.locate import modulus_image as modulus_image
 from palpate.mesh.locate import point_interpolation as point_interpolation
 from palpate.mesh.quality import check_mesh as check_mesh
 from palpate.mesh.space import Constraint as Constraint

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from palpate.study.case import MeshSettings as MeshSettings
     from palpate.study.case_body import Phantom as Phantom
     from palpate.study.case_file import read_case as read_case
+    from palpate.study.case_loads import loads_on as loads_on
     from palpate.study.cost import ExpectedCost as ExpectedCost
     from palpate.study.cost import expected_cost as expected_cost
     from palpate.study.earlier import strange_files as strange_files
