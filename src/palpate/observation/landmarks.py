@@ -17,18 +17,8 @@ from palpate.errors import InputDataError
 from palpate.findings import Finding
 from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.named_labels import printable
-from palpate.mesh.locate import located
-from palpate.mesh.space import LagrangeSpace
-from palpate.observation.contract import DataFile, ReactionOf
-from palpate.observation.measured_points import (
-    MeasuredPoints,
-    PointTable,
-    checked_table,
-    read_point_table,
-    read_text,
-    refuse_slips,
-)
-from palpate.observation.point_displacement import PointDisplacement, point_displacement
+from palpate.observation.contract import DataFile
+from palpate.observation.measured_points import MeasuredPoints, PointTable, checked_table, read_point_table, read_text
 
 Marks = list[tuple[str, NDArray[np.float64]]]  # labels and points, RAS mm, NaN of one that was not placed
 TO_RAS = {"LPS": LPS_TO_RAS, "RAS": np.ones(3), "1": LPS_TO_RAS, "0": np.ones(3)}
@@ -41,29 +31,19 @@ PLACED = ("2", "")  # behind the columns that a .fcsv of 3D Slicer 5 names: 0 un
 class Landmarks(MeasuredPoints):
     """Pairs of points, each of which counts by itself; implements `DataSource`."""
 
-    def on(self, space: LagrangeSpace, reaction_of: ReactionOf) -> tuple[PointDisplacement, tuple[Finding, ...]]:
-        """The term of the pairs that lie in the mesh; raises `InputDataError` where none does."""
-        del reaction_of
-        table, places = self.table, located(space.mesh, self.table.before)
-        refuse_slips(space, table.before, places.inside, self.file.paths[0])
-        inside, findings = places.inside, list(table.pairing)
-        names = [name or f"number {number}" for number, name in enumerate(table.names, start=1)]
-        if not inside.all():
-            text = (
-                f"{np.count_nonzero(~inside)} of {len(inside)} landmarks of '{self.file.paths[0].name}' lie outside of"
-                f" the meshed body and are left out: {_shown([names[i] for i in np.flatnonzero(~inside)])}"
-            )
-            findings.append(Finding("points-outside", text, place=f"in state {self.file.state}"))
-        term = point_displacement(
-            space,
-            table.before[inside],
-            table.moved[inside],
-            places.of(inside),
-            file=self.file,
-            description="the distance between landmarks of the model and where they were measured",
-            labels=tuple(names[i] for i in np.flatnonzero(inside)),
+    description = "the distance between landmarks of the model and where they were measured"
+
+    def named(self, inside: NDArray[np.bool_]) -> tuple[tuple[str, ...], tuple[Finding, ...]]:
+        """Names of the points inside the mesh, a mask (n,); those outside, and how the pairs were found, are told."""
+        names = np.array([name or f"number {number}" for number, name in enumerate(self.table.names, start=1)])
+        if inside.all():
+            return tuple(names.tolist()), self.table.pairing
+        text = (
+            f"{np.count_nonzero(~inside)} of {len(inside)} landmarks of '{self.file.paths[0].name}' lie outside of the"
+            f" meshed body and are left out: {_shown(names[~inside].tolist())}"
         )
-        return term, tuple(findings)
+        outside = Finding("points-outside", text, place=f"in state {self.file.state}")
+        return tuple(names[inside].tolist()), (*self.table.pairing, outside)
 
 
 def read_landmarks(file: DataFile) -> Landmarks:

@@ -56,9 +56,9 @@ def point_displacement(
     points: NDArray[np.float64],
     moved: NDArray[np.float64],
     places: Places,
-    *,
     file: DataFile,
     description: str,
+    *,
     cells: NDArray[np.int64] | None = None,
     labels: tuple[str, ...] = (),
 ) -> PointDisplacement:
