@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.errors import InputDataError
-from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Role
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import DataFile
@@ -58,11 +57,10 @@ def read_displacement_field(file: DataFile) -> DisplacementField:
                 ' all of them, or state single ones as kind = "landmarks"'
             )
         return DisplacementField(file, table)
-    vectors, affine, digests = read_field(path, file.axes)
+    vectors, grid, digests = read_field(path, file.axes)
     given = np.isfinite(vectors).all(axis=-1) & vectors.any(axis=-1)
     if not given.any():
         raise InputDataError(f"'{path}' holds no vector but zeros; give a field that moves something")
-    grid = VoxelGrid((vectors.shape[0], vectors.shape[1], vectors.shape[2]), affine)
     before = grid.world(np.argwhere(given).astype(np.float64))
     table = PointTable(before, before + vectors[given], ("",) * len(before), digests)
     return DisplacementField(file, checked_table(table, path))
