@@ -225,6 +225,19 @@ def test_volume_cells_beside_tetrahedra_are_refused_by_number_and_kind(tmp_path,
         read_mesh_file(path)
 
 
+def test_arrays_outside_of_an_xdmf_files_folder_are_not_read(tmp_path):
+    """Nor where the name is broken by a comment, as a parser joins its parts."""
+    of, path = block(), tmp_path / "in" / "m.xdmf"
+    path.parent.mkdir()
+    meshio.write(path, meshio.Mesh(of.nodes, [("tetra", of.tets)]))
+    (path.parent / "m.h5").rename(tmp_path / "m.h5")
+    text = path.read_text()
+    for name in ("../m.h5:", ".<!-- -->./m.h5:", f"{tmp_path}/m.h5:"):
+        path.write_text(text.replace("m.h5:", name))
+        with pytest.raises(InputDataError, match="outside its own folder"):
+            read_mesh_file(path)
+
+
 def test_a_file_says_which_cell_data_it_has(tmp_path):
     of = block()
     meshio.write(
