@@ -170,6 +170,7 @@ def test_a_deck_is_read_as_abaqus_reads_it(tmp_path):
         ("*INSTANCE, NAME=A-1, PART=A\n1.0, 0.0, 0.0", "by \\*INSTANCE"),
         ("*NODE, SYSTEM=C\n900, 1.0, 0.0, 0.0", "by \\*NODE"),
         ("*NODE\n1, 1.0, 0.0, 0.0", "have one number"),
+        ("*ELEMENT, TYPE=S3\n900, 1, 2, 999", "name nodes that it has not"),
         ("*ELEMENT, TYPE=C3D99X\n900, 1, 2", "'C3D99X' have not 99 nodes each"),
         ("*ELEMENT, TYPE=C3D5\n900, 1, 2, 3, 4, 5", "it has 1 volume of 5 nodes"),
         ("*ELEMENT, TYPE=XYZ\n900, 1, 2", "'XYZ' are not known"),

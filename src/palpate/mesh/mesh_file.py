@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.errors import ConfigurationError, InputDataError
-from palpate.images.input_file import open_input
+from palpate.images.input_file import whole_input
 from palpate.images.named_labels import printable
 from palpate.mesh.cutting import face_pieces
 from palpate.mesh.files.abaqus import read_abaqus
@@ -54,13 +54,7 @@ def read_mesh_file(path: Path, *, data: str | None = None) -> MeshFile:
     data: the cell data that tell the tissue, by default the first of the usual names. Raises `InputDataError` for a
     file that holds no such mesh, or more, `ConfigurationError` where meshio is missing.
     """
-    try:
-        with open_input(path) as file:
-            if file.n_bytes > MOST_BYTES:
-                raise InputDataError(f"'{path}' has {file.n_bytes / 2**30:.1f} GB; meshes of up to 4 GB are read")
-            content, digest = file.read(), file.sha256()
-    except (OSError, ValueError) as error:
-        raise InputDataError(f"'{path}' cannot be read: {error}; check the path") from error
+    content, digest = whole_input(path, MOST_BYTES)
     reader = READERS.get(path.suffix.lower())
     if reader is read_gmsh and b"$MeshFormat" not in content[:4096]:
         reader = None  # the ending is Fluent's, too
@@ -82,20 +76,15 @@ def _sound(read: Elements, digest: str) -> MeshFile:
     """The mesh, its nodes numbered anew, with all that speaks of them; `InputDataError` for what is no sound one."""
     tets, of_tets = read.of(TETRAHEDRA, 4)
     triangles, of_triangles = read.of(TRIANGLES, 3)
-    count = Counter[str]()
-    for kind, rows in read.blocks:
-        count[kind] += len(rows)
-    others = ", ".join(
-        f"{n} {kind}" for kind, n in count.items() if n and kind not in TETRAHEDRA and not kind.startswith(HOLLOW)
-    )
-    if others and len(tets):
-        raise InputDataError(
-            f"beside {len(tets)} tetrahedra it has {others}: split these into tetrahedra of 4 or 10 nodes"
-        )
+    count = sum((Counter({kind: len(rows)}) for kind, rows in read.blocks), Counter[str]())
     if not len(tets):
         raise InputDataError(f"it holds {dict(count)} and no tetrahedra; export a volume mesh of 4 or 10 nodes a cell")
-    if tets.min() < 0 or tets.max() >= len(read.points) or read.points.shape[1] != 3:
-        raise InputDataError(f"its tetrahedra name nodes that it has not ({len(read.points)} nodes); export it again")
+    if others := [f"{n} {kind}" for kind, n in count.items() if not kind.startswith(HOLLOW) and kind not in TETRAHEDRA]:
+        also = ", ".join(others)
+        raise InputDataError(f"beside {len(tets)} tetrahedra it has {also}: split these into some of 4 or 10 nodes")
+    corners = np.concatenate([tets.ravel(), triangles.ravel()])
+    if corners.min() < 0 or corners.max() >= len(read.points) or read.points.shape[1] != 3:
+        raise InputDataError(f"its elements name nodes that it has not ({len(read.points)} nodes); export it again")
     _, first, same = np.unique(np.sort(tets, axis=1), axis=0, return_index=True, return_inverse=True)
     kept = np.sort(first)  # gmsh writes what is in two groups twice
     number = np.full((2, sum(count.values())), -1)

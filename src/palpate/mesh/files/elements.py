@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import InputDataError
-
 MOST_BYTES = 4 * 2**30
 Name = int | str
 Numbers = NDArray[np.int64]
@@ -32,17 +30,7 @@ class Elements:
 
     def of(self, kinds: Sequence[str], corners: int) -> tuple[Numbers, Numbers]:
         """Corners (n, corners) of the elements of some kinds, and the number (n,) of each."""
-        firsts = np.cumsum([0, *(len(rows) for _, rows in self.blocks)])
-        chosen = [(rows[:, :corners], n) for n, (kind, rows) in zip(firsts, self.blocks, strict=False) if kind in kinds]
-        rows = np.concatenate([np.zeros((0, corners), dtype=np.int64), *(rows for rows, _ in chosen)])
-        numbers = [first + np.arange(len(own)) for own, first in chosen]
-        return rows.astype(np.int64), np.concatenate([np.zeros(0, dtype=np.int64), *numbers])
-
-
-def places(numbers: Numbers, wanted: Numbers, of: str) -> Numbers:
-    """Where each of the `wanted` (...) stands in `numbers` (n,), from 0; raises `InputDataError` where one does not."""
-    missing = np.setdiff1d(wanted, numbers)
-    if len(missing):
-        raise InputDataError(f"it names {len(missing)} {of} that it has not, the first of the number {missing[0]}")
-    order = np.argsort(numbers, kind="stable")
-    return np.asarray(order[np.searchsorted(numbers, wanted, sorter=order)])
+        own = [(kind in kinds, rows) for kind, rows in self.blocks]
+        corner = [np.zeros((0, corners), dtype=np.int64), *(rows[:, :corners] for chosen, rows in own if chosen)]
+        number = np.flatnonzero(np.concatenate([[], *(np.full(len(rows), chosen) for chosen, rows in own)]))
+        return np.concatenate(corner).astype(np.int64), number

@@ -70,7 +70,6 @@ def _variables(content: bytes) -> tuple[dict[str, Any], dict[str, str]]:
         wanted = {name: data for name, data in getattr(file, "variables", file).items() if WANTED.match(name)}
         if sum(8.0 * np.prod(data.shape) for data in wanted.values()) > MOST_BYTES:
             raise InputDataError(f"its arrays have over {MOST_BYTES / 2**30:.0f} GB")
-        attributes = {name: data if classic else data.attrs for name, data in wanted.items()}
+        kinds = {name: (vars(data) if classic else data.attrs).get("elem_type", b"") for name, data in wanted.items()}
         arrays = {name: np.array(data[:]) for name, data in wanted.items()}
-        kinds = {n: getattr(a, "elem_type", b"") if classic else a.get("elem_type", b"") for n, a in attributes.items()}
     return arrays, {name: kind.decode() if isinstance(kind, bytes) else str(kind) for name, kind in kinds.items()}
