@@ -22,7 +22,7 @@ from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.mesh.voxelise import voxelise
-from palpate.observation.measured_motion import measured_motion
+from palpate.observation.measured_motion import MeasuredMotion
 from palpate.observation.measured_points import MeasuredPoints
 from palpate.progress import Progress
 from palpate.study.case import Case
@@ -75,7 +75,7 @@ def with_prescribed(states: ImagedStates, case: Case) -> ImagedStates:
                 f"the motion of '{surfaces[0]}' is prescribed, and no [[data]] of state {state} says where points went:"
                 ' give landmarks or a displacement field, or the surface another boundary ("moving", "fixed")'
             )
-        motion = measured_motion(points, kernel_mm=case.driver.kernel_mm, amplitude_mm=case.driver.prior_mm)
+        motion = MeasuredMotion(points, case.driver.kernel_mm, case.driver.prior_mm)
         for name in surfaces:
             motion.require(mesh.nodes[np.unique(boundary_named(mesh, name))], name)
         found.append({names.index(name): motion for name in surfaces})
