@@ -123,9 +123,7 @@ def _oriented(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> tuple[NDAr
     flat = np.abs(volumes) <= SLIVER * edges.max(axis=1) ** 3
     if flat.any():
         where = _place(corners[flat].mean(axis=1))
-        raise InputDataError(
-            f"{flat.sum()} of its tetrahedra have no volume, the first {where}; repair it, by Mmg or gmsh"
-        )
+        raise InputDataError(f"{flat.sum()} of its tetrahedra have no volume, the first {where}; mend it (Mmg, gmsh)")
     shortest = np.full(len(nodes), np.inf)
     np.minimum.at(shortest, tets, edges.min(axis=1)[:, None])
     near = np.asarray(cKDTree(nodes).query(nodes, k=2)[0])[:, 1]
@@ -136,10 +134,8 @@ def _oriented(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> tuple[NDAr
             f" {_place(nodes[apart])}, {near[apart][0]:.2g} mm apart; merge such nodes (gmsh: Coherence Mesh)"
         )
     piece, with_face = face_pieces(tets)
-    if with_face.max() > 2:
-        raise InputDataError(
-            f"{(with_face > 2).sum()} faces belong to over two tetrahedra, which overlap: mesh it anew"
-        )
+    if over := np.count_nonzero(with_face > 2):
+        raise InputDataError(f"{over} faces belong to over two tetrahedra, which overlap: mesh it anew")
     return np.where(volumes[:, None] < 0.0, tets[:, [0, 2, 1, 3]], tets), piece
 
 

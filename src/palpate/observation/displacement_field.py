@@ -53,8 +53,7 @@ def read_displacement_field(file: DataFile) -> DisplacementField:
         table = read_point_table(path)
         if len(table.before) < FEWEST:
             raise InputDataError(
-                f"'{path}' holds {len(table.before)} of the {FEWEST} points or more that a displacement field has; give"
-                ' all of them, or state single ones as kind = "landmarks"'
+                f"'{path}' holds {len(table.before)} of the {FEWEST} points or more of a field; state them as landmarks"
             )
         return DisplacementField(file, table)
     vectors, grid, digests = read_field(path, file.axes)

@@ -57,8 +57,7 @@ def _signs(told: str, axes: str, path: Path) -> NDArray[np.float64]:
     """What turns vectors to RAS, by the axes that the file tells ("": none) and those that the case states."""
     if told and axes not in ("", told):
         raise InputDataError(
-            f"the vectors of '{path}' are in {told}, as it says, and the case states axes = \"{axes}\"; take the key"
-            " out, or correct the file, where it is wrong"
+            f"the vectors of '{path}' are in {told}, as it says, not in {axes}, as the case states; take the key out"
         )
     if not told and not axes:
         raise InputDataError(
@@ -100,9 +99,8 @@ def _nifti_kind(header: Any, axes: str, path: Path) -> tuple[NDArray[np.float64]
         return _signs("RAS", axes, path), NAMES[name]
     if intent in OF_FSL or name.startswith("NREG"):
         raise InputDataError(
-            f"'{path}' holds no displacements in mm (intent {intent}, {printable(name)!r}); convert splines or"
-            " velocities of NiftyReg by reg_transform -disp, a warp of FSL by wb_command -convert-warpfield -from-fnirt"
-            ' ... -to-world, and state axes = "RAS"'
+            f"'{path}' holds no displacements in mm (intent {intent}, {printable(name)!r}); convert it by reg_transform"
+            " -disp of NiftyReg, a warp of FSL by wb_command -convert-warpfield -from-fnirt ... -to-world"
         )
     return _signs({DISPVECT: "RAS", VECTOR: axes or "LPS"}.get(intent, ""), axes, path), False
 
@@ -155,8 +153,7 @@ def _transform(path: Path, axes: str) -> Field:
     }
     if not images:
         raise InputDataError(
-            f"'{path}' holds no displacement field, or an inverted one ({', '.join(part.GetName() for part in parts)});"
-            " write the transform as a field on the first image's grid"
+            f"'{path}' holds no displacement field, or an inverted one; write it as a field on the first image's grid"
         )
     finest = min(reversed(images.values()), key=lambda image: float(np.prod(image.GetSpacing())))
     _refuse_many(finest.GetSize(), path)
@@ -168,8 +165,7 @@ def _transform(path: Path, axes: str) -> Field:
         whole[~inside] = np.nan
     if np.isnan(whole).all():
         raise InputDataError(
-            f"the {len(images)} fields of '{path}' have grids that no point's way keeps to; write the transform as one"
-            " field on the first image's grid"
+            f"the {len(images)} fields of '{path}' have grids that no way keeps to; write the transform as one field"
         )
     turn = np.diag([*(signs * LPS_TO_RAS), 1.0])
     return whole * signs, VoxelGrid(grid.shape, turn @ grid.affine), tuple(digests)

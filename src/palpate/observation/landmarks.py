@@ -62,8 +62,7 @@ def read_landmarks(file: DataFile) -> Landmarks:
     where = " and ".join(f"'{path.name}'" for path in file.paths)
     if len(lists) != 2:
         raise InputDataError(
-            f"{where} hold {len(lists)} list(s) of points; landmarks need two, before and after: name two files,"
-            " file and file_after"
+            f"{where} hold {len(lists)} list(s) of points; landmarks need two: name two files, file and file_after"
         )
     labels = [[label for label, _ in own] for own in lists]
     pairs = np.array(_pairs(labels[0], labels[1], where), dtype=np.int64).reshape(-1, 2)
@@ -100,8 +99,7 @@ def _pairs(first: Sequence[str], second: Sequence[str], where: str) -> list[tupl
         most = max(most, len(both))
     if most or len(first) != len(second):
         raise InputDataError(
-            f"{where} hold {len(first)} points before and {len(second)} after, of which {most} have a label that both"
-            " lists have once; give the two points of each landmark the same label"
+            f"{where} hold {len(first)} and {len(second)} points, {most} of one label; give each pair the same label"
         )
     return [(n, n) for n in range(len(first))]
 
@@ -114,9 +112,7 @@ def _markups(content: str, path: Path) -> list[Marks]:
             system = str(markup.get("coordinateSystem", "LPS")).upper()
             units = markup.get("coordinateUnits", "mm")  # a word, or a list of a code, its scheme and its meaning
             if system not in TO_RAS or (units[0] if isinstance(units, list) else units) != "mm":
-                raise InputDataError(
-                    f"'{path}' has coordinates in {system[:20]!r}, {str(units)[:20]!r}; export LPS or RAS in mm"
-                )
+                raise InputDataError(f"'{path}' is in {system[:20]!r}, {str(units)[:20]!r}; export LPS or RAS in mm")
             points = []
             for point in markup["controlPoints"]:
                 placed = point.get("positionStatus", "defined") == "defined" and point.get("position") is not None
@@ -125,8 +121,7 @@ def _markups(content: str, path: Path) -> list[Marks]:
             lists.append(points)
     except (ValueError, RecursionError, LookupError, TypeError, AttributeError) as error:
         raise InputDataError(
-            f"'{path}' is no markups file of 3D Slicer ({type(error).__name__}: {error}); landmarks are read from"
-            " .mrk.json, .fcsv and .csv"
+            f"'{path}' is no .mrk.json of 3D Slicer ({type(error).__name__}: {error}); export it again"
         ) from error
     return lists
 

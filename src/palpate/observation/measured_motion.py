@@ -65,8 +65,7 @@ class MeasuredMotion:
         if n < FEWEST or far:
             place = np.round(points[int(np.argmax(distance))], 1).tolist()
             raise InputDataError(
-                f"the motion of the surface '{name}' is prescribed by {n} measured points, and"
-                f" {far} of its {len(points)} nodes lie further than {self.kernel_mm:g} mm ([driver]"
-                f" kernel_mm) from all of them, the farthest {distance.max():.3g} mm, at {place} mm; measure {FEWEST}"
+                f"'{name}' is prescribed by {n} measured points, and {far} of its {len(points)} nodes lie further than"
+                f" {self.kernel_mm:g} mm ([driver] kernel_mm) from all, the farthest at {place} mm; measure {FEWEST}"
                 ' points or more beside it, or give it the boundary "moving"'
             )

@@ -139,16 +139,13 @@ def read_point_table(path: Path) -> PointTable:
         lines.fieldnames = names = [name.strip().lower() for name in lines.fieldnames or ()]
         if missing := [name for name in COLUMNS if name not in names]:
             raise InputDataError(
-                f"the table '{path}' lacks the column(s) {', '.join(missing)}; its first line must name before_x,"
-                " before_y, before_z, after_x, after_y, after_z (RAS, mm)"
+                f"'{path}' lacks the column(s) {', '.join(missing)}; its first line needs {', '.join(COLUMNS)} (RAS mm)"
             )
         for line in lines:
             rows.append([float(line[name] or "nan") for name in COLUMNS])
             labels.append(printable((line.get("label") or "").strip()[:200]))
     except (TypeError, ValueError, csv.Error) as error:
-        raise InputDataError(
-            f"line {lines.line_num} of '{path}' holds no six numbers ({error}); correct it, or take it out"
-        ) from error
+        raise InputDataError(f"line {lines.line_num} of '{path}' holds no six numbers ({error}); correct it") from error
     values = np.array(rows, dtype=np.float64).reshape(-1, 2, 3)
     return checked_table(PointTable(values[:, 0], values[:, 1], tuple(labels), (digest,)), path)
 
@@ -169,22 +166,18 @@ def checked_table(table: PointTable, path: Path) -> PointTable:
     bad = np.flatnonzero(~(np.abs(np.concatenate([table.before, table.after], axis=1)) < FARTHEST).all(axis=1))
     if len(bad):
         raise InputDataError(
-            f"pair {bad[0] + 1} of '{path}' has a coordinate that is missing, no number or absurd ({len(bad)} of"
-            f" {len(table.before)} pairs); take such pairs out"
+            f"{len(bad)} pairs of '{path}', the first {bad[0] + 1}, have absurd coordinates or no number; take them out"
         )
     if np.array_equal(table.before, table.after):
-        raise InputDataError(
-            f"the points of '{path}' lie where they lay before, to the last digit; give the later ones, too"
-        )
+        raise InputDataError(f"the points of '{path}' lie where they lay before, to the last digit; give later ones")
     step = -(-len(table.before) // MOST_POINTS)
     points, moved = (values[::step] - values.mean(axis=0) for values in (table.before, table.moved))
     slopes = np.linalg.lstsq(points, moved, rcond=FLAT)[0]  # 0 across points that lie in a plane
     least = float(np.linalg.svd(slopes)[1][-1])
     if len(points) >= SEVERAL and least > STRETCH:  # a rotation leaves its axis where it is
         raise InputDataError(
-            f"the displacements of '{path}' change by {least:.2g} mm or more for each mm between its points, in every"
-            " direction, as no body's do: they are positions in place of displacements, in another unit, or of other"
-            " points; correct the file"
+            f"the displacements of '{path}' change by {least:.2g} mm a mm or more in every direction, as no body's do:"
+            " they are positions in place of displacements, in another unit, or of other points; correct the file"
         )
     return table
 
@@ -196,14 +189,12 @@ def _refuse_slips(mesh: TetMesh, points: NDArray[np.float64], inside: NDArray[np
         there = float(located(mesh, points * turn).inside.mean())
         if there > max(SLIP, share + SLIP):
             raise InputDataError(
-                f"{share:.0%} of the points of '{path}' lie in the meshed body, and {there:.0%} would if {words};"
-                " tables of points are read as RAS mm: export it so"
+                f"{share:.0%} of the points of '{path}' lie in the mesh, and {there:.0%} would if {words}; write RAS mm"
             )
     if not inside.any():
         low, high = points.min(axis=0).round(1).tolist(), points.max(axis=0).round(1).tolist()
         raise InputDataError(
-            f"none of the {len(inside)} points of '{path}' lies in the meshed body: they lie between {low} and"
-            f" {high} mm (RAS); give points of this patient, in the world of the first image"
+            f"none of the {len(inside)} points of '{path}' lies in the mesh: they span {low} to {high} mm; give this patient's"
         )
 
 

@@ -21,6 +21,12 @@ KEYS_OF_LOADS = {
     "traction": ("surface", "traction_kpa"),
     "gravity": ("acceleration_m_s2",),
 }
+DIRECTION = rule(between=(-1e3, 1e3), test=any, wanted="the way that the force acts, not (0, 0, 0)")
+COVARIANCE = rule(
+    instead_of="sd_mm",
+    test=lambda rows: np.allclose(rows, np.transpose(rows)) and np.linalg.eigvalsh(rows)[0] > 0.0,
+    wanted="a symmetric and positive definite matrix, mm^2",
+)
 register_brought()  # before the words that a case may use are listed
 
 
@@ -39,31 +45,22 @@ class CaseData:
     file_after: Path | None = None
     state: int = field(default=1, metadata=rule(between=(1, 1000)))
     sd_mm: float | None = field(default=None, metadata=rule(between=(1e-6, 100.0)))
-    covariance_mm2: tuple[Row, Row, Row] | None = field(default=None, metadata=rule(instead_of="sd_mm"))
+    covariance_mm2: tuple[Row, Row, Row] | None = field(default=None, metadata=COVARIANCE)
     correlation_mm: float = field(default=0.0, metadata=rule(between=(0.0, 1e3)))
     axes: str | None = field(default=None, metadata=rule(choices=("LPS", "RAS")))
     surface: str | None = None
     force_n: float | None = field(default=None, metadata=rule(between=FORCES_N))
-    direction: Row | None = field(default=None, metadata=rule(between=(-1e3, 1e3)))
+    direction: Row | None = field(default=None, metadata=DIRECTION)
     sd_n: float | None = field(default=None, metadata=rule(between=(1e-9, 1e6)))
     offset_sd_n: float = field(default=0.0, metadata=rule(between=(0.0, 1e6)))
 
     def __post_init__(self) -> None:
         kind = SOURCES[self.kind]
         _check_keys(self, "[[data]]", kind.needs, kind.may_have)
-        if self.direction is not None and not any(self.direction):
-            raise ConfigurationError("[[data]] direction is (0, 0, 0), which is none; give the way that the force acts")
         if self.file is not None and self.sd_mm is None and self.covariance_mm2 is None:
             raise ConfigurationError(
-                f"[[data]] '{self.file.name}' says nothing of its errors: give sd_mm, the standard deviation of each"
-                " component (mm), by which it counts beside the images"
+                f"[[data]] '{self.file.name}' says nothing of its errors: give sd_mm, that of a component in mm"
             )
-        if self.covariance_mm2 is not None:
-            matrix = np.array(self.covariance_mm2)
-            if not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix)[0] <= 0.0:
-                raise ConfigurationError(
-                    f"[[data]] covariance_mm2 is {matrix.tolist()}; it must be symmetric and positive definite, mm^2"
-                )
 
     @property
     def tells_scale(self) -> bool:

@@ -95,9 +95,7 @@ def _read(source: Path | io.BytesIO, kind: str | None = None) -> Any:
         with contextlib.redirect_stdout(io.StringIO()) as said:  # it prints why it does not read a file
             return meshio.read(source, kind)
     except SystemExit as error:  # and ends the program
-        raise InputDataError(
-            f"meshio does not read it: {said.getvalue().strip()}; export it as .vtu or .msh"
-        ) from error
+        raise InputDataError(f"meshio says: {said.getvalue().strip()}; export it as .vtu or .msh") from error
 
 
 def _elements(mesh: Any, key: str | None, names: Names = lambda _, number: (number,)) -> Elements:
