@@ -38,7 +38,8 @@ class DisplacementField(MeasuredPoints):
         nodes = mesh.nodes[np.unique(mesh.tets[np.isin(mesh.region, sought)])]
         away = np.asarray(cKDTree(nodes).query(points)[0])
         level = np.minimum(np.floor(np.log2(np.maximum(away / size, 1.0))), COARSER)[:, None]
-        return np.floor(np.hstack([(points - points.min(axis=0)) / (size * 2.0**level), level])).astype(np.int64)
+        cells = np.hstack([(points - points.min(axis=0)) / (size * 2.0**level), level])
+        return np.asarray(np.floor(cells), dtype=np.int64)
 
 
 def read_displacement_field(file: DataFile) -> DisplacementField:

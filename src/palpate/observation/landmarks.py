@@ -53,30 +53,29 @@ def read_landmarks(file: DataFile) -> Landmarks:
     """
     if file.paths[0].suffix.lower() == ".csv" and len(file.paths) == 1:
         return Landmarks(file, read_point_table(file.paths[0]))
-    lists, digests = list[Marks](), []
+    lists, digests = list[Marks](), list[str]()
     for path in file.paths:
         content, digest = read_text(path)
-        reader = _fcsv if path.name.lower().endswith(".fcsv") else _markups
-        lists += reader(content, path)
+        lists += (_fcsv if path.name.lower().endswith(".fcsv") else _markups)(content, path)
         digests.append(digest)
     where = " and ".join(f"'{path.name}'" for path in file.paths)
     if len(lists) != 2:
         raise InputDataError(
             f"{where} hold {len(lists)} list(s) of points; landmarks need two: name two files, file and file_after"
         )
-    labels = [[label for label, _ in own] for own in lists]
-    pairs = np.array(_pairs(labels[0], labels[1], where), dtype=np.int64).reshape(-1, 2)
-    points = np.array([[own[n][1] for own, n in zip(lists, pair, strict=True)] for pair in pairs]).reshape(-1, 2, 3)
-    placed = np.isfinite(points).all(axis=(1, 2))
+    first, second = ([label for label, _ in own] for own in lists)
+    before, after = (np.reshape([point for _, point in own], (-1, 3)) for own in lists)
+    pairs = np.reshape(_pairs(first, second, where), (-1, 2)).astype(np.int64)
+    pairs = pairs[np.isfinite(before[pairs[:, 0]] + after[pairs[:, 1]]).all(axis=1)]
     left = dict.fromkeys(
-        own[n] or f"number {n + 1}"
-        for own, used in zip(labels, pairs[placed].T, strict=True)
-        for n in np.setdiff1d(np.arange(len(own)), used)
+        labels[n] or f"number {n + 1}"
+        for labels, used in zip((first, second), pairs.T, strict=True)
+        for n in np.setdiff1d(np.arange(len(labels)), used)
     )
     text = f"{len(left)} landmarks of {where} are not placed in both lists, and are left out: {_shown(list(left))}"
     findings = (Finding("points-unpaired", text, place=f"in state {file.state}"),) if left else ()
-    names = tuple(labels[0][n] for n in pairs[placed, 0])
-    table = PointTable(points[placed, 0], points[placed, 1], names, tuple(digests), findings)
+    names = tuple(first[n] for n in pairs[:, 0])
+    table = PointTable(before[pairs[:, 0]], after[pairs[:, 1]], names, tuple(digests), findings)
     return Landmarks(file, checked_table(table, file.paths[0]))
 
 

@@ -76,9 +76,10 @@ class MeasuredPoints:
 
     description = ""
 
-    def cells(self, mesh: TetMesh, points: NDArray[np.float64]) -> NDArray[np.int64] | None:
-        """What the points (n, 3) mm of one mean have in common, (n, k) numbers; None: each stands alone."""
-        del mesh, points
+    def cells(self, mesh: TetMesh, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Numbers (n, k) that points (n, 3) mm have in common whose mean is compared; here each stands alone."""
+        del mesh
+        return np.arange(len(points))[:, None]
 
     def named(self, inside: NDArray[np.bool_]) -> tuple[tuple[str, ...], tuple[Finding, ...]]:
         """Names of the points inside the mesh, a mask (n,), or none, and what is to be said of the others."""
@@ -194,7 +195,7 @@ def _refuse_slips(mesh: TetMesh, points: NDArray[np.float64], inside: NDArray[np
     if not inside.any():
         low, high = points.min(axis=0).round(1).tolist(), points.max(axis=0).round(1).tolist()
         raise InputDataError(
-            f"none of the {len(inside)} points of '{path}' lies in the mesh: they span {low} to {high} mm; give this patient's"
+            f"no point of '{path}' lies in the mesh: they span {low} to {high} mm (RAS); give this patient's"
         )
 
 

@@ -23,7 +23,7 @@ class PointDisplacement(StatedNoise):
 
     interpolation: N (n, n_dofs) to the points, or to means of several; measured: d (n,) mm; whitening: W (n, n), which
     makes their errors independent, each with the standard deviation stated. material (n, 3) mm: the point that a
-    residual is of; axes (n, 3): along which; labels (n / 3,): names of the points, () where they have none.
+    residual is of, along x, y or z in turn; labels (n / 3,): names of the points, () where they have none.
     """
 
     description: str
@@ -32,19 +32,16 @@ class PointDisplacement(StatedNoise):
     measured: NDArray[np.float64]
     whitening: sparse.csr_matrix[np.float64]
     material: NDArray[np.float64]
-    axes: NDArray[np.float64]
     labels: tuple[str, ...] = ()
 
     unit = "mm"
 
     def residuals(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Residuals:
         """Residuals and their derivative at displacements (n,) mm of the points; linear, and without an `offset`."""
-        n = len(self.measured)
-        values = np.asarray(self.whitening @ (displacement - self.measured)) + offset
-        weights = np.full(n, 1.0 / n)
-        motions = self.point_motions(displacement)
-        away = np.linalg.norm(motions.fitted - motions.observed, axis=1)
-        return Residuals(values, weights, self.material, self.axes, self.material, self.whitening, away)
+        n, off = len(self.measured), displacement - self.measured
+        values, weights = np.asarray(self.whitening @ off) + offset, np.full(n, 1.0 / n)
+        away, axes = np.linalg.norm(off.reshape(-1, 3), axis=1), np.tile(np.eye(3), (n // 3, 1))
+        return Residuals(values, weights, self.material, axes, self.material, self.whitening, away)
 
     def point_motions(self, displacement: NDArray[np.float64]) -> PointMotions:
         """The points, or means of some, as measured and at their displacements (n,) mm."""
@@ -83,7 +80,6 @@ def point_displacement(
         measured=np.asarray(mean @ moved).ravel(),
         whitening=sparse.csr_matrix(sparse.kron(mixed, apart)),
         material=np.repeat(np.asarray(mean @ points), 3, axis=0),
-        axes=np.tile(np.eye(3), (n, 1)),
         labels=labels,
     )
 

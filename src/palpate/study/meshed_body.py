@@ -143,8 +143,8 @@ def _regions(file: MeshFile, case: Case) -> tuple[list[Tissue], NDArray[np.int64
     if len(left := np.flatnonzero(region < 0)):
         groups = sorted(str(name) for name, own in file.groups.items() if np.isin(own, left).any())
         raise ConfigurationError(
-            f"no tissue has {len(left)} of the tetrahedra, which are in the group(s) {groups}; give them one, or the"
-            ' label "remaining"'
+            f"no tissue of the case has {len(left)} of the tetrahedra, which are in the group(s) {groups}; give them"
+            ' one, or the label "remaining"'
         )
     return tissues, region
 
