@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from palpate.errors import InputDataError
-from palpate.mesh.files.elements import Elements, Name, Numbers
+from palpate.mesh.files.elements import CORNERS, Block, Elements, Numbers
 
 SOLID = re.compile(r"(?:A|DC?|Q|CO)?C?3D(\d+)")
 SOLIDS = {4: "tetra", 6: "wedge", 8: "hexahedron", 10: "tetra10", 15: "wedge15", 20: "hexahedron20"}
@@ -22,6 +22,7 @@ MOST_MEMBERS = 10**7
 FLAT = "write one part, all of whose nodes and elements are listed"
 NONE = np.zeros(0, dtype=np.int64)
 Options = dict[str, str]
+Table = tuple[str, Numbers]
 Rows = list[list[str]]
 
 
@@ -40,14 +41,10 @@ class _Sets(dict[str, Numbers]):
             raise InputDataError(f"it names a set '{unknown[0][:80]}' that it has not")
         return np.concatenate([NONE, *(self[word] if word in self else np.array([int(word)]) for word in words)])
 
-    def placed(self, numbers: Numbers) -> dict[Name, list[Numbers]]:
-        """The members by their places in `numbers`; what is not there is passed over, as Abaqus does."""
-        return {name: [np.flatnonzero(np.isin(numbers, own))] for name, own in self.items()}
-
 
 def read_abaqus(content: bytes, _: str | None) -> Elements:
     """Elements with their sets and surfaces; raises `InputDataError` for what is none, or is not listed in it."""
-    nodes, points, tables = list[int](), list[list[str]](), list[tuple[str, Numbers]]()
+    nodes, points, tables, surfaces = list[int](), list[list[str]](), list[Table](), list[tuple[str, Numbers]]()
     known, n_parts = {"NSET": _Sets(), "ELSET": _Sets()}, 0
     for keyword, options, rows in _keywords(content.decode(errors="replace")):
         n_parts += keyword == "PART"
@@ -65,14 +62,22 @@ def read_abaqus(content: bytes, _: str | None) -> Elements:
             numbers = _generated(rows) if "GENERATE" in options else known[keyword].listed(rows)
             known[keyword].add(options.get(keyword), numbers)
         elif keyword == "SURFACE":
-            _surface(options, rows, known, tables)
+            name, listed = options.get("NAME", "").upper(), [row[:1] for row in rows]
+            if options.get("TYPE", "").upper() == "NODE":
+                known["NSET"].add(name, known["NSET"].listed(listed))
+            else:
+                surfaces += [(name, faces) for faces in _faces(rows, known["ELSET"], tables)]
     numbers, at = np.concatenate([NONE, *(table[:, 0] for _, table in tables)]), {n: at for at, n in enumerate(nodes)}
     if len(at) < len(nodes) or len(np.unique(numbers)) < len(numbers):
         raise InputDataError(f"two nodes or two elements have one number; {FLAT}")
     placed = np.vectorize(lambda number: at.get(number, -1), otypes=[np.int64])
-    blocks = [(kind, placed(table[:, 1:])) for kind, table in tables]
-    sets, point_sets = known["ELSET"].placed(numbers), known["NSET"].placed(np.array(nodes, dtype=np.int64))
-    return Elements(np.array(points, dtype=float), blocks, sets, point_sets)
+    cells = [(kind, table[:, 0], placed(table[:, 1:])) for kind, table in tables]
+    blocks: list[Block] = [(kind, rows, ()) for kind, _, rows in cells]
+    for name, members in known["ELSET"].items():
+        blocks += [(kind, rows[np.isin(number, members)], [name]) for kind, number, rows in cells if kind in CORNERS]
+    blocks += [("triangle", placed(faces), [name]) for name, faces in surfaces]
+    blocks += [("node", placed(np.intersect1d(of, nodes))[:, None], [name]) for name, of in known["NSET"].items()]
+    return Elements(np.array(points, dtype=float), blocks)
 
 
 def _generated(rows: Rows) -> Numbers:
@@ -83,17 +88,12 @@ def _generated(rows: Rows) -> Numbers:
     return np.concatenate([NONE, *map(np.array, steps)]).astype(np.int64)
 
 
-def _surface(options: Options, rows: Rows, known: Mapping[str, _Sets], tables: list[tuple[str, Numbers]]) -> None:
-    """A surface as a set of nodes, or of triangles, which join the elements under numbers below 0."""
-    name, tables_of = options.get("NAME"), [table[:, :5] for kind, table in tables if kind.startswith("tetra")]
-    if options.get("TYPE", "").upper() == "NODE":
-        known["NSET"].add(name, known["NSET"].listed([row[:1] for row in rows]))
-    tets = np.concatenate([np.zeros((0, 5), dtype=np.int64), *tables_of])
+def _faces(rows: Rows, sets: _Sets, tables: Sequence[Table]) -> Iterator[Numbers]:
+    """The faces (n, 3) of a surface, by their nodes' numbers: rows of a set or an element, and the face's name."""
+    tets = [table[:, :5] for kind, table in tables if kind.startswith("tetra")]
     for face, corners in FACES.items():
-        own = tets[np.isin(tets[:, 0], known["ELSET"].listed([row[:1] for row in rows if row[-1].upper() == face]))]
-        numbers = -1 - sum(len(table) for _, table in tables) - np.arange(len(own))
-        tables.append(("triangle", np.c_[numbers, own[:, corners]]))
-        known["ELSET"].add(name, numbers)
+        wanted = sets.listed([row[:1] for row in rows if row[-1].upper() == face])
+        yield from (table[np.isin(table[:, 0], wanted)][:, corners] for table in tets)
 
 
 def _keywords(text: str) -> Iterator[tuple[str, Options, Rows]]:

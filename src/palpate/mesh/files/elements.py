@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 MOST_BYTES = 4 * 2**30
+CORNERS = {"tetra": 4, "tetra10": 4, "triangle": 3, "triangle6": 3, "node": 1}  # of what is read; the last is of sets
 Name = int | str
 Numbers = NDArray[np.int64]
-Sets = Mapping[Name, Sequence[Numbers]]
+Block = tuple[str, Numbers, Collection[Name]]
 
 
 @dataclass(frozen=True, slots=True)
 class Elements:
-    """Points (n, 3); blocks of elements of one kind, in meshio's words, (n, k) numbers of points, corners first.
+    """Points (n, 3), and blocks: kind in meshio's words, numbers (n, k) of points, corners first, and groups.
 
-    sets: elements, counted through all blocks, by the name or the number of their set, in one or several parts;
-    point_sets: points. about: what else the file says of groups.
+    All elements of a block are in its groups, which have a name or a number; one that is in others may stand in further
+    blocks. about: what else the file says of groups.
     """
 
     points: NDArray[np.float64]
-    blocks: Sequence[tuple[str, Numbers]]
-    sets: Sets = field(default_factory=dict)
-    point_sets: Sets = field(default_factory=dict)
+    blocks: Sequence[Block]
     about: str = ""
-
-    def of(self, kinds: Sequence[str], corners: int) -> tuple[Numbers, Numbers]:
-        """Corners (n, corners) of the elements of some kinds, and the number (n,) of each."""
-        own = [(kind in kinds, rows) for kind, rows in self.blocks]
-        corner = [np.zeros((0, corners), dtype=np.int64), *(rows[:, :corners] for chosen, rows in own if chosen)]
-        number = np.flatnonzero(np.concatenate([[], *(np.full(len(rows), chosen) for chosen, rows in own)]))
-        return np.concatenate(corner).astype(np.int64), number

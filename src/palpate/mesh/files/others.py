@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import re
-from collections import defaultdict
 from collections.abc import Callable, Collection
 from importlib import import_module
 from pathlib import Path
@@ -17,11 +16,10 @@ import numpy as np
 
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.input_file import beside
-from palpate.mesh.files.elements import Elements, Name, Numbers
+from palpate.mesh.files.elements import CORNERS, Block, Elements, Name
 
 GROUPS = ["tissue", "label", "region", "medit:ref", "gmsh:physical", "MaterialID", "material", "CellEntityIds"]
 GROUPS += ["tetgen:ref", "netgen:index", "nastran:ref", "avsucd:material", "ugrid:ref", "su2:tag"]
-DIMENSIONS = {"tetra": 3, "tetra10": 3, "triangle": 2, "triangle6": 2}
 Names = Callable[[int, int], Collection[Name]]  # the groups of elements of a dimension with a number
 
 
@@ -100,23 +98,22 @@ def _read(source: Path | io.BytesIO, kind: str | None = None) -> Any:
 
 def _elements(mesh: Any, key: str | None, names: Names = lambda _, number: (number,)) -> Elements:
     """What meshio has read, with the groups that the cell data `key` number, and MED's groups of nodes."""
-    blocks = [(b.type, np.asarray(b.data if b.type in DIMENSIONS else [()] * len(b.data), int)) for b in mesh.cells]
-    sets, point_sets = defaultdict[Name, list[Numbers]](list), defaultdict[Name, list[Numbers]](list)
+    blocks = list[Block]()
     about = f"its cell data, of which tissue_data may name one, are {sorted(mesh.cell_data)}" if mesh.cell_data else ""
-    if key is not None:
-        if key not in mesh.cell_data:
-            raise InputDataError(f"it has no cell data '{key}'; {about}")
-        dimension = np.repeat([DIMENSIONS.get(kind, 0) for kind, _ in blocks], [len(rows) for _, rows in blocks])
-        every = np.c_[dimension, np.concatenate(mesh.cell_data[key])]
-        if not np.array_equal(every[dimension > 0], np.rint(every[dimension > 0])):
+    if key is not None and key not in mesh.cell_data:
+        raise InputDataError(f"it has no cell data '{key}'; {about}")
+    for number, (kind, data) in enumerate((cells.type, cells.data) for cells in mesh.cells):
+        if key is None or kind not in CORNERS:
+            blocks.append((kind, np.asarray(data if kind in CORNERS else [()] * len(data), int), ()))
+            continue
+        values = mesh.cell_data[key][number]
+        if not np.array_equal(values, np.rint(values)):
             raise InputDataError(f"its cell data '{key}' are no whole numbers; name others in tissue_data")
-        for d, value in np.unique(every[dimension > 0], axis=0):
-            for name in names(int(d), int(value)):
-                sets[name].append(np.flatnonzero((every == (d, value)).all(axis=1)))
+        for value in np.unique(values):
+            blocks.append((kind, np.asarray(data[values == value], int), names(CORNERS[kind] - 1, int(value))))
     for tag, families in getattr(mesh, "point_tags", {}).items():
-        for name in families:
-            point_sets[name].append(np.flatnonzero(mesh.point_data["point_tags"] == tag))
-    return Elements(np.asarray(mesh.points, dtype=float), blocks, sets, point_sets, about)
+        blocks.append(("node", np.argwhere(mesh.point_data["point_tags"] == tag), families))
+    return Elements(np.asarray(mesh.points, dtype=float), blocks, about)
 
 
 def _entities(content: bytes, *, binary: bool) -> dict[tuple[int, int], list[int]]:
