@@ -47,8 +47,8 @@ def listed_faces(faces: NDArray[np.int64], triangles: NDArray[np.int64], name: s
     found = np.isin(number[: len(faces)], number[len(faces) :])
     if inner := len(triangles) - np.count_nonzero(found):
         raise GeometryError(
-            f"{inner} of the {len(triangles)} triangles of the group '{name}' are no faces of the mesh's boundary but"
-            " lie inside; name a group of outer faces alone"
+            f"{inner} of the {len(triangles)} triangles of the group '{name}' are no faces of the mesh's boundary;"
+            " name a group of outer faces alone"
         )
     return np.asarray(found)
 
