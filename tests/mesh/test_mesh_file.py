@@ -170,6 +170,7 @@ def test_a_deck_is_read_as_abaqus_reads_it(tmp_path):
         ("*INSTANCE, NAME=A-1, PART=A\n1.0, 0.0, 0.0", "by \\*INSTANCE"),
         ("*NODE, SYSTEM=C\n900, 1.0, 0.0, 0.0", "by \\*NODE"),
         ("*NODE\n1, 1.0, 0.0, 0.0", "have one number"),
+        ("*ELEMENT, TYPE=S3\n900, 1, 2, 999", "name nodes that it has not"),
         ("*ELEMENT, TYPE=C3D99X\n900, 1, 2", "'C3D99X' have not 99 nodes each"),
         ("*ELEMENT, TYPE=C3D5\n900, 1, 2, 3, 4, 5", "it has 1 volume of 5 nodes"),
         ("*ELEMENT, TYPE=XYZ\n900, 1, 2", "'XYZ' are not known"),
@@ -223,6 +224,19 @@ def test_volume_cells_beside_tetrahedra_are_refused_by_number_and_kind(tmp_path,
         meshio.write(path, meshio.Mesh(of.nodes, cells), file_format="gmsh22", binary=False)
     with pytest.raises(InputDataError, match=f"beside 72 tetrahedra it has 3 {kind}: split these"):
         read_mesh_file(path)
+
+
+def test_arrays_outside_of_an_xdmf_files_folder_are_not_read(tmp_path):
+    """Nor where the name is broken by a comment, as a parser joins its parts."""
+    of, path = block(), tmp_path / "in" / "m.xdmf"
+    path.parent.mkdir()
+    meshio.write(path, meshio.Mesh(of.nodes, [("tetra", of.tets)]))
+    (path.parent / "m.h5").rename(tmp_path / "m.h5")
+    text = path.read_text()
+    for name in ("../m.h5:", ".<!-- -->./m.h5:", f"{tmp_path}/m.h5:"):
+        path.write_text(text.replace("m.h5:", name))
+        with pytest.raises(InputDataError, match="outside its own folder"):
+            read_mesh_file(path)
 
 
 def test_a_file_says_which_cell_data_it_has(tmp_path):

@@ -15,12 +15,12 @@ from palpate.images.distance import distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.mesh.locate import located
 from palpate.mesh.space import lagrange_space
-from palpate.observation.contract import DataFile, Observation, OfMaterial, OfPoints, Rematched, Weighting, n_seen
+from palpate.observation.contract import DataFile, Observation, OfMaterial, OfPoints, Rematched, n_seen
 from palpate.observation.force import Force
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
-from palpate.observation.robust_loss import PowerLaw
+from palpate.observation.stated_noise import stated_noise
 from palpate.observation.surface_distance import SurfaceDistance, surface_distance
 from palpate.observation.target import surface_target, target_from
 from palpate.phantoms.shapes import Ellipsoid, rotation_about
@@ -124,9 +124,8 @@ class Spring:
 
 
 def of_force(_sphere, _point_motion):
-    noise = NoiseModel(np.array([0.04]), np.array([1e-3]))
     spring = Spring(np.arange(6), np.zeros(3))
-    term = Force("force", spring, np.eye(3)[2], 1.5, noise, noise, Weighting(25.0, PowerLaw()))
+    term = Force("force", *stated_noise(0.2, 1), spring, np.eye(3)[2], 1.5)
     return term.under(np.array([2.0, 3.0]), np.zeros(2))
 
 

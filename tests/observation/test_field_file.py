@@ -11,6 +11,7 @@ import pytest
 import SimpleITK
 
 from palpate.errors import InputDataError
+from palpate.observation import field_file
 from palpate.observation.contract import DataFile
 from palpate.observation.displacement_field import read_displacement_field
 
@@ -283,6 +284,8 @@ LISTED = (
         ("one.xfm", None, "does not say"),
         ("one.xfm", INVERTED, "an inverted one"),
         ("one.xfm", ("one_grid_0", "../one_grid_0"), "outside its own folder"),
+        ("one.xfm", ("Displacement", "Displacement_Volume = ../a.mnc;\nDisplacement"), "outside its own folder"),
+        ("one.xfm", ("Displacement_Volume = one", '"Displacement_Volume"="../one'), "outside its own folder"),
         ("one.tfm", LISTED, "2 transforms"),
     ],
 )
@@ -295,10 +298,20 @@ def test_a_part_is_never_taken_for_the_whole(tmp_path, name, change, words):
         read(path, "LPS" if change and name.endswith(".xfm") else "")
 
 
+def test_the_grid_of_an_xfm_is_measured_before_it_is_read(tmp_path, monkeypatch):
+    path = tmp_path / "one.xfm"
+    SimpleITK.WriteTransform(transform(), str(path))
+    path.write_text(path.read_text().replace("one_grid_0.mnc", '"one_grid_0.mnc"').replace("%", "# = ../a;\n%"))
+    check(path, "LPS")
+    monkeypatch.setattr(field_file, "MOST_VECTORS", 200)
+    with pytest.raises(InputDataError, match=r"one_grid_0.mnc' has 5 x 6 x 7 vectors"):
+        read(path, "LPS")
+
+
 def test_a_transform_without_a_field_and_an_unknown_kind_are_refused(tmp_path):
     SimpleITK.WriteTransform(transform(SHIFT), str(tmp_path / "shift.tfm"))
     with pytest.raises(InputDataError, match="holds no displacement field"):
         read(tmp_path / "shift.tfm")
     (tmp_path / "warp.m3z").write_bytes(b"")
-    with pytest.raises(InputDataError, match="no kind of displacement field"):
+    with pytest.raises(InputDataError, match="no kind of field"):
         read(tmp_path / "warp.m3z")

@@ -15,10 +15,10 @@ from palpate.mechanics.laws.registry import law_named
 from palpate.mechanics.linear_model import linear_model, poisson_tangents
 from palpate.mechanics.loads import boundary_named
 from palpate.mechanics.reaction import surface_reaction
-from palpate.observation.contract import Weighting, seen_by
+from palpate.observation.contract import seen_by
 from palpate.observation.force import Force
 from palpate.observation.noise_model import NoiseModel
-from palpate.observation.robust_loss import PowerLaw
+from palpate.observation.stated_noise import stated_noise
 from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
 from palpate.uncertainty import (
@@ -86,14 +86,14 @@ def test_the_displacement_changes_with_poissons_ratio_as_differences_say(twin, d
 def test_a_force_changes_with_poissons_ratio_as_differences_say(twin, dilatation):
     """By the displacement and directly: with the latter left out it would change the other way."""
     h, direction = 1e-4, np.array([0.0, 1.0, 0.3])
-    triangles, stated = boundary_named(twin.model.space.mesh, "tube"), NoiseModel(np.array([1e-4]), np.array([1e-3]))
+    triangles = boundary_named(twin.model.space.mesh, "tube")
 
     def pulled(ratio):
         """The force on the tube where the tissue around it has a Poisson's ratio; its term and the equilibrium."""
         model = with_poisson(twin, {"rest": ratio}, dilatation)
         there = model.solve(twin.moduli, twin.coefficients)
         reaction = surface_reaction(model.space, triangles, direction, law_named("linear"), dilatation=dilatation)
-        term = Force("force", reaction, direction, 0.0, stated, stated, Weighting(1.0, PowerLaw()))
+        term = Force("force", *stated_noise(0.01, 1), reaction, direction, 0.0)
         seen = term.under(twin.moduli, np.zeros(0)).residuals(there.values[term.dofs])
         return term, there, seen
 

@@ -77,15 +77,28 @@ def open_input(path: Path) -> InputFile:
 def whole_input(path: Path, limit: int) -> tuple[bytes, str]:
     """All bytes of the file at `path`, and their SHA-256.
 
-    Raises `InputDataError` for a file that cannot be read or has more than `limit` bytes.
+    Raises `InputDataError` for a file that cannot be read or has more than `limit` bytes, before it takes memory.
     """
     try:
-        content, digest = read_input(path, limit)
+        with open_input(path) as file:
+            if file.n_bytes > limit:
+                raise InputDataError(f"'{path}' is larger than {limit} bytes; is it another file? Else make it smaller")
+            content = file.read(limit)
     except (OSError, ValueError) as error:
         raise InputDataError(f"'{path}' cannot be read ({error}); check the path") from error
-    if len(content) > limit:
-        raise InputDataError(f"'{path}' is larger than {limit} bytes; is it another file? Else make it smaller")
-    return content, digest
+    return content, hashlib.sha256(content).hexdigest()
+
+
+def beside(path: Path, name: str) -> Path:
+    """Where the file `name` lies that the file at `path` names: in the same folder, or below it, links followed.
+
+    Raises `InputDataError` where it leads elsewhere.
+    """
+    folder = path.parent.resolve()
+    target = (folder / name).resolve()
+    if not target.is_relative_to(folder):
+        raise InputDataError(f"'{path}' names a file outside its own folder, which is not read; put both into one")
+    return target
 
 
 def read_input(path: Path, limit: int) -> tuple[bytes, str]:

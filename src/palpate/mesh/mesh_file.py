@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.errors import ConfigurationError, InputDataError
-from palpate.images.input_file import open_input
+from palpate.images.input_file import whole_input
 from palpate.images.named_labels import printable
 from palpate.mesh.cutting import face_pieces
 from palpate.mesh.files.abaqus import read_abaqus
-from palpate.mesh.files.elements import MOST_BYTES, Elements, Name, Sets
+from palpate.mesh.files.elements import CORNERS, MOST_BYTES, Elements, Name, Numbers
 from palpate.mesh.files.exodus import read_exodus
 from palpate.mesh.files.others import read_by_meshio, read_gmsh, read_med
 from palpate.mesh.tet_mesh import FACE_PAIRS
@@ -24,7 +24,6 @@ from palpate.mesh.tetrahedralise import boundary_of
 
 READERS = {".msh": read_gmsh, ".inp": read_abaqus, ".med": read_med}
 READERS |= dict.fromkeys((".e", ".exo", ".ex2", ".exii", ".g", ".gen"), read_exodus)
-TETRAHEDRA, TRIANGLES = ("tetra", "tetra10"), ("triangle", "triangle6")
 HOLLOW = ("vertex", "line", "tri", "quad", "polygon", "VTK_LAGRANGE_C", "VTK_LAGRANGE_TR", "VTK_LAGRANGE_Q")
 SLIVER = 1e-9  # volume over the cube of the longest edge
 JOINED = 1e-3  # of the shortest edge at a node: another one so near is meant to be the same
@@ -54,13 +53,7 @@ def read_mesh_file(path: Path, *, data: str | None = None) -> MeshFile:
     data: the cell data that tell the tissue, by default the first of the usual names. Raises `InputDataError` for a
     file that holds no such mesh, or more, `ConfigurationError` where meshio is missing.
     """
-    try:
-        with open_input(path) as file:
-            if file.n_bytes > MOST_BYTES:
-                raise InputDataError(f"'{path}' has {file.n_bytes / 2**30:.1f} GB; meshes of up to 4 GB are read")
-            content, digest = file.read(), file.sha256()
-    except (OSError, ValueError) as error:
-        raise InputDataError(f"'{path}' cannot be read: {error}; check the path") from error
+    content, digest = whole_input(path, MOST_BYTES)
     reader = READERS.get(path.suffix.lower())
     if reader is read_gmsh and b"$MeshFormat" not in content[:4096]:
         reader = None  # the ending is Fluent's, too
@@ -80,48 +73,41 @@ def read_mesh_file(path: Path, *, data: str | None = None) -> MeshFile:
 
 def _sound(read: Elements, digest: str) -> MeshFile:
     """The mesh, its nodes numbered anew, with all that speaks of them; `InputDataError` for what is no sound one."""
-    tets, of_tets = read.of(TETRAHEDRA, 4)
-    triangles, of_triangles = read.of(TRIANGLES, 3)
-    count = Counter[str]()
-    for kind, rows in read.blocks:
-        count[kind] += len(rows)
-    others = ", ".join(
-        f"{n} {kind}" for kind, n in count.items() if n and kind not in TETRAHEDRA and not kind.startswith(HOLLOW)
-    )
-    if others and len(tets):
-        raise InputDataError(
-            f"beside {len(tets)} tetrahedra it has {others}: split these into tetrahedra of 4 or 10 nodes"
-        )
+    count = sum((Counter({kind: len(rows)}) for kind, rows, _ in read.blocks), Counter[str]())
+    (tets, groups), (triangles, shown), (points, sets) = (_once(read, corners) for corners in (4, 3, 1))
     if not len(tets):
         raise InputDataError(f"it holds {dict(count)} and no tetrahedra; export a volume mesh of 4 or 10 nodes a cell")
-    if tets.min() < 0 or tets.max() >= len(read.points) or read.points.shape[1] != 3:
-        raise InputDataError(f"its tetrahedra name nodes that it has not ({len(read.points)} nodes); export it again")
-    _, first, same = np.unique(np.sort(tets, axis=1), axis=0, return_index=True, return_inverse=True)
-    kept = np.sort(first)  # gmsh writes what is in two groups twice
-    number = np.full((2, sum(count.values())), -1)
-    number[0, of_tets] = np.searchsorted(kept, first)[same.ravel()]
-    number[1, of_triangles] = np.arange(len(triangles))
-    used, places = np.unique(tets[kept], return_inverse=True)
-    nodes, tets = read.points[used], places.reshape(-1, 4)
+    if others := [f"{n} {kind}" for kind, n in count.items() if kind not in CORNERS and not kind.startswith(HOLLOW)]:
+        also = ", ".join(others)
+        raise InputDataError(f"beside {len(tets)} tetrahedra it has {also}: split these into some of 4 or 10 nodes")
+    corners = np.concatenate([tets.ravel(), triangles.ravel(), points.ravel()])
+    if corners.min() < 0 or corners.max() >= len(read.points) or read.points.shape[1] != 3:
+        raise InputDataError(f"its elements name nodes that it has not ({len(read.points)} nodes); export it again")
+    used, places = np.unique(tets, return_inverse=True)
     new = np.full(len(read.points), -1)
     new[used] = np.arange(len(used))
-    tets, piece = _oriented(nodes, tets)
-    groups = {name: own for name, own in _members(read.sets, number[0]).items() if len(own)}
+    tets, piece = _oriented(read.points[used], places.reshape(-1, 4))
     if not any(isinstance(name, int) for name in groups) and len(groups) < 2:
         groups[1] = np.arange(len(tets))
-    shown = {name: new[triangles[own]] for name, own in _members(read.sets, number[1]).items() if len(own)}
-    surfaces = {name: np.unique(np.sort(rows, axis=1), axis=0) for name, rows in shown.items()}
-    faces = boundary_of(tets) if read.point_sets else tets[:0, :3]
-    for name, own in _members(read.point_sets, new).items():
-        surfaces.setdefault(name, faces[np.isin(faces, own).all(axis=1)])
-    return MeshFile(nodes, tets, piece, groups, surfaces, read.about, digest)
+    surfaces = {name: np.unique(np.sort(new[triangles[own]], axis=1), axis=0) for name, own in shown.items()}
+    faces = boundary_of(tets) if sets else tets[:0, :3]
+    for name, own in sets.items():
+        surfaces.setdefault(name, faces[np.isin(faces, new[points[own]]).all(axis=1)])
+    return MeshFile(read.points[used], tets, piece, groups, surfaces, read.about, digest)
 
 
-def _members(sets: Sets, number: NDArray[np.int64]) -> dict[Name, NDArray[np.int64]]:
-    """New numbers of the members of each set, each once, by the old ones' new `number`, -1 for what is left out."""
-    shown = {name: name if isinstance(name, int) else printable(name)[:200] for name in sets}
-    every = {shown[name]: np.unique(number[np.concatenate(parts)]) for name, parts in sets.items() if parts}
-    return {name: own[own >= 0] for name, own in every.items()}
+def _once(read: Elements, corners: int) -> tuple[Numbers, dict[Name, Numbers]]:
+    """All elements (n, corners) of so many corners, each once, in their order, and which ones a group has."""
+    blocks = [(rows[:, :corners], names) for kind, rows, names in read.blocks if CORNERS.get(kind) == corners]
+    every = np.concatenate([np.zeros((0, corners), dtype=np.int64), *(rows for rows, _ in blocks)])
+    _, first, same = np.unique(np.sort(every, axis=1), axis=0, return_index=True, return_inverse=True)
+    kept, groups = np.sort(first), defaultdict[Name, Numbers](lambda: np.zeros(0, dtype=np.int64))
+    parts = np.split(np.searchsorted(kept, first)[same.ravel()], np.cumsum([len(rows) for rows, _ in blocks]))
+    for own, (_, names) in zip(parts, blocks, strict=False):
+        for name in names if len(own) else ():
+            shown = name if isinstance(name, int) else printable(name)[:200]
+            groups[shown] = np.union1d(groups[shown], own)
+    return every[kept], dict(groups)
 
 
 def _oriented(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -134,9 +120,7 @@ def _oriented(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> tuple[NDAr
     flat = np.abs(volumes) <= SLIVER * edges.max(axis=1) ** 3
     if flat.any():
         where = _place(corners[flat].mean(axis=1))
-        raise InputDataError(
-            f"{flat.sum()} of its tetrahedra have no volume, the first {where}; repair it, by Mmg or gmsh"
-        )
+        raise InputDataError(f"{flat.sum()} of its tetrahedra have no volume, the first {where}; mend it (Mmg, gmsh)")
     shortest = np.full(len(nodes), np.inf)
     np.minimum.at(shortest, tets, edges.min(axis=1)[:, None])
     near = np.asarray(cKDTree(nodes).query(nodes, k=2)[0])[:, 1]
@@ -147,10 +131,8 @@ def _oriented(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> tuple[NDAr
             f" {_place(nodes[apart])}, {near[apart][0]:.2g} mm apart; merge such nodes (gmsh: Coherence Mesh)"
         )
     piece, with_face = face_pieces(tets)
-    if with_face.max() > 2:
-        raise InputDataError(
-            f"{(with_face > 2).sum()} faces belong to over two tetrahedra, which overlap: mesh it anew"
-        )
+    if over := np.count_nonzero(with_face > 2):
+        raise InputDataError(f"{over} faces belong to over two tetrahedra, which overlap: mesh it anew")
     return np.where(volumes[:, None] < 0.0, tets[:, [0, 2, 1, 3]], tets), piece
 
 

@@ -32,8 +32,8 @@ def plane_faces(
     lean = float(np.degrees(np.arccos(min(area[axis] / max(float(np.linalg.norm(area)), 1e-300), 1.0))))
     if found.any() and lean > LEANS_DEG:
         raise GeometryError(
-            f"the faces within {within_mm:g} mm of {plane} lean against that plane by {lean:.0f} degrees: they are part"
-            " of a surface that does not lie along it; name the surface by a group of faces of the mesh's file"
+            f"the faces within {within_mm:g} mm of {plane} lean against that plane by {lean:.0f} degrees; name the"
+            " surface by a group of faces"
         )
     return found
 
@@ -43,14 +43,12 @@ def listed_faces(faces: NDArray[np.int64], triangles: NDArray[np.int64], name: s
 
     Raises `GeometryError` where one is no face of the boundary: it lies between two tetrahedra, or is of none.
     """
-    rows = np.sort(np.concatenate([faces, triangles]), axis=1)
-    number = np.unique(rows, axis=0, return_inverse=True)[1].ravel()
+    number = np.unique(np.sort(np.concatenate([faces, triangles]), axis=1), axis=0, return_inverse=True)[1].ravel()
     found = np.isin(number[: len(faces)], number[len(faces) :])
-    if found.sum() < len(triangles):
+    if inner := len(triangles) - np.count_nonzero(found):
         raise GeometryError(
-            f"{len(triangles) - found.sum()} of the {len(triangles)} triangles of the group '{name}' are no faces of"
-            " the mesh's boundary: they lie inside, between two tetrahedra, or are faces of none; name a group of outer"
-            " faces alone"
+            f"{inner} of the {len(triangles)} triangles of the group '{name}' are no faces of the mesh's boundary;"
+            " name a group of outer faces alone"
         )
     return np.asarray(found)
 
@@ -64,23 +62,21 @@ def tissues_behind(
     groups of the file name. Raises `GeometryError` for a surface without a face, or one that is free in part.
     """
     behind, names = np.full(n_faces, len(tissues) - 1), [tissue.name for tissue in tissues]
-    for name, faces in list(surfaces.items())[::-1]:
-        if not faces.any():
-            raise GeometryError(
-                f"the surface '{name}' has no face of the mesh's boundary; make within_mm larger, or name another"
-            )
-        behind[faces] = names.index(name)
     free = np.array([tissue.role is Role.VOID for tissue in tissues])
+    for name, faces in list(surfaces.items())[::-1]:
+        behind[faces] = names.index(name)
     for name, faces in surfaces.items():
-        own, held = behind[faces], not free[names.index(name)]
-        if not np.any(own == names.index(name)):
+        number, own = names.index(name), behind[faces]
+        lost = own[free[own]]
+        if not len(own):
+            raise GeometryError(f"the surface '{name}' has no face of the boundary; make within_mm larger")
+        if number not in own:
             raise GeometryError(
-                f"all faces of the surface '{name}' belong to surfaces that are named before it; name it first, or"
-                " leave it out"
+                f"all faces of the surface '{name}' belong to surfaces that are named before it; name it first"
             )
-        if name in grouped and held and free[own].any():
+        if name in grouped and not free[number] and len(lost):
             raise GeometryError(
-                f"{free[own].sum()} of the {len(own)} faces of the surface '{name}' would be free, as they belong to"
-                f" '{names[int(own[free[own]][0])]}', which is named before it; name '{name}' first"
+                f"{len(lost)} of the {len(own)} faces of the surface '{name}' would be free, as they belong to"
+                f" '{names[int(lost[0])]}', which is named before it; name '{name}' first"
             )
     return behind

@@ -5,24 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate.errors import InputDataError
-from palpate.findings import Finding
-from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Role
-from palpate.mesh.locate import located
-from palpate.mesh.space import LagrangeSpace
-from palpate.observation.contract import DataFile, ReactionOf
+from palpate.mesh.tet_mesh import TetMesh
+from palpate.observation.contract import DataFile
 from palpate.observation.field_file import read_field
-from palpate.observation.measured_points import (
-    MeasuredPoints,
-    PointTable,
-    checked_table,
-    read_point_table,
-    refuse_slips,
-)
-from palpate.observation.point_displacement import PointDisplacement, point_displacement
+from palpate.observation.measured_points import MeasuredPoints, PointTable, checked_table, read_point_table
 
 FEWEST = 4  # points that tell a motion which is not the same everywhere
 COARSER = 2  # times the edge of a cell is doubled, at the most
@@ -33,33 +24,22 @@ OF_LENGTH, OF_EDGE = 0.5, 0.6  # edge of a cell, over the correlation length and
 class DisplacementField(MeasuredPoints):
     """Points that are many, whose errors may be alike; implements `DataSource`."""
 
-    def on(self, space: LagrangeSpace, reaction_of: ReactionOf) -> tuple[PointDisplacement, tuple[Finding, ...]]:
-        """The term of the points in the mesh, in means of some that are near each other; raises `InputDataError`.
+    description = "the difference between the model's displacement and a measured field"
+
+    def cells(self, mesh: TetMesh, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The cell (n, 4) of each point (n, 3) mm: three numbers and its level, by which edges are doubled.
 
         What is nearer than half a correlation length, or six tenths of an edge, says the same. How an organ's stiffness
         moves what lies outside varies over as much as lies between (Saint-Venant): there means are of twice as much at
         each twofold distance.
         """
-        del reaction_of
-        places = located(space.mesh, self.table.before)
-        inside = places.inside
-        refuse_slips(space, self.table.before, inside, self.file.paths[0])
-        points, moved = self.table.before[inside], self.table.moved[inside]
-        size = max(OF_LENGTH * self.file.correlation_mm, OF_EDGE * space.mesh.usual_edge_mm)
-        mesh, sought = space.mesh, [n for n, t in enumerate(space.mesh.tissues) if t.role is Role.ESTIMATE]
-        nodes = np.unique(mesh.tets[np.isin(mesh.region, sought)])
-        away = np.asarray(cKDTree(mesh.nodes[nodes]).query(points)[0])
+        size = max(OF_LENGTH * self.file.correlation_mm, OF_EDGE * mesh.usual_edge_mm)
+        sought = [n for n, tissue in enumerate(mesh.tissues) if tissue.role is Role.ESTIMATE]
+        nodes = mesh.nodes[np.unique(mesh.tets[np.isin(mesh.region, sought)])]
+        away = np.asarray(cKDTree(nodes).query(points)[0])
         level = np.minimum(np.floor(np.log2(np.maximum(away / size, 1.0))), COARSER)[:, None]
-        term = point_displacement(
-            space,
-            points,
-            moved,
-            places.of(inside),
-            file=self.file,
-            description="the difference between the model's displacement and a measured field",
-            cells=np.floor(np.hstack([(points - points.min(axis=0)) / (size * 2.0**level), level])).astype(np.int64),
-        )
-        return term, ()
+        cells = np.hstack([(points - points.min(axis=0)) / (size * 2.0**level), level])
+        return np.asarray(np.floor(cells), dtype=np.int64)
 
 
 def read_displacement_field(file: DataFile) -> DisplacementField:
@@ -74,15 +54,13 @@ def read_displacement_field(file: DataFile) -> DisplacementField:
         table = read_point_table(path)
         if len(table.before) < FEWEST:
             raise InputDataError(
-                f"'{path}' holds {len(table.before)} of the {FEWEST} points or more that a displacement field has; give"
-                ' all of them, or state single ones as kind = "landmarks"'
+                f"'{path}' holds {len(table.before)} of the {FEWEST} points or more of a field; state them as landmarks"
             )
         return DisplacementField(file, table)
-    vectors, affine, digests = read_field(path, file.axes)
+    vectors, grid, digests = read_field(path, file.axes)
     given = np.isfinite(vectors).all(axis=-1) & vectors.any(axis=-1)
     if not given.any():
         raise InputDataError(f"'{path}' holds no vector but zeros; give a field that moves something")
-    grid = VoxelGrid((vectors.shape[0], vectors.shape[1], vectors.shape[2]), affine)
     before = grid.world(np.argwhere(given).astype(np.float64))
     table = PointTable(before, before + vectors[given], ("",) * len(before), digests)
     return DisplacementField(file, checked_table(table, path))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,59 +13,30 @@ from palpate.findings import Finding
 from palpate.images.alignment import RigidMotion
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.space import LagrangeSpace
-from palpate.observation.contract import DataFile, Fit, Reaction, ReactionOf, Residuals, Weighting
-from palpate.observation.noise_model import FitResponse, NoiseModel
-from palpate.observation.robust_loss import FAR, PowerLaw
-
-ALONE = 1e-3  # mm: no other residual is alike
+from palpate.observation.contract import DataFile, Reaction, ReactionOf, Residuals
+from palpate.observation.stated_noise import StatedNoise, stated_noise
 
 
 @dataclass(frozen=True, slots=True)
-class Force:
+class Force(StatedNoise):
     """Residual r = F(u; E) + b - f of a force f (N) on a surface, b the load cell's offset; an `Observation`.
 
     at: moduli (n_regions,) kPa and coefficients (n_material,) of the material under which it is asked, None: none yet.
     """
 
-    name: str
     reaction: Reaction
     direction: NDArray[np.float64]
     measured: float
-    stated: NoiseModel
-    noise_model: NoiseModel
-    weighting: Weighting
     offset_sd: float = 0.0
     at: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
-    @property
-    def kind(self) -> str:
-        """Each force has an error of its own."""
-        return self.name
-
-    @property
-    def description(self) -> str:
-        """What the misfit is, for a methods section."""
-        return "the difference between the force that holds a surface of the model and the measured one"
-
-    @property
-    def unit(self) -> str:
-        """Newton."""
-        return "N"
+    description = "the difference between the force that holds a surface of the model and the measured one"
+    unit = "N"
 
     @property
     def dofs(self) -> NDArray[np.int64]:
         """Numbers (n_dofs,) of the unknowns of the elements at the surface."""
         return self.reaction.dofs
-
-    @property
-    def of_driver(self) -> bool:
-        """It shows no wall."""
-        return False
-
-    @property
-    def observed_share(self) -> float:
-        """The whole force."""
-        return 1.0
 
     def under(self, moduli: NDArray[np.float64], material: NDArray[np.float64]) -> Force:
         """The same at moduli (n_regions,) kPa and coefficients (n_material,) of the material."""
@@ -100,42 +70,6 @@ class Force:
             raise ConfigurationError(f"the {self.name} depends on the moduli: ask for its residuals `under` some")
         return self.at
 
-    def with_noise(self, noise: NoiseModel) -> Force:
-        """The same, counting by the variance of the noise."""
-        return replace(self, noise_model=noise, weighting=Weighting(1.0 / noise.sd**2, PowerLaw()))
-
-    @property
-    def sd_bounds(self) -> tuple[float, float]:
-        """What is stated: there is no second force that would tell more."""
-        return self.stated.sd, self.stated.sd
-
-    def with_sd(self, sd: float) -> Force:
-        """The same; a force that all else contradicts counts less, the further off it is."""
-        return replace(self, weighting=Weighting(1.0 / sd**2, PowerLaw(FAR * sd)))
-
-    def with_correlation(self, noise: NoiseModel) -> Force:
-        """The same noise: it is one residual."""
-        return replace(self, noise_model=noise)
-
-    def weighed(self, residuals: Residuals) -> Residuals:
-        """The same: it is one residual."""
-        return residuals
-
-    def first_noise(self, peers: Sequence[Force]) -> NoiseModel:
-        """What is stated."""
-        del peers
-        return self.stated
-
-    def fitted_noise(self, residuals: Sequence[Residuals], response: FitResponse | None = None) -> NoiseModel:
-        """What is stated."""
-        del residuals, response
-        return self.stated
-
-    def fit(self, residuals: Residuals) -> Fit:
-        """How far the model's force is off, N."""
-        off = float(np.abs(residuals.values[0]))
-        return Fit(off, off, off, None)
-
 
 @dataclass(frozen=True, slots=True)
 class ForceMeasurement:
@@ -143,10 +77,7 @@ class ForceMeasurement:
 
     file: DataFile
 
-    @property
-    def digests(self) -> tuple[str, ...]:
-        """There is no file."""
-        return ()
+    digests = ()  # there is no file
 
     @property
     def in_words(self) -> str:
@@ -165,21 +96,6 @@ class ForceMeasurement:
         """The term on a meshed body; raises `ConfigurationError` for a surface that it has not."""
         del space
         file, direction = self.file, np.array(self.file.direction)
-        stated = NoiseModel(np.array([file.sd_n**2]), np.array([ALONE]))
-        reaction = reaction_of(file.surface, direction)
-        term = Force(
-            file.name,
-            reaction,
-            direction / np.linalg.norm(direction),
-            file.force_n,
-            stated,
-            stated,
-            Weighting(1.0 / file.sd_n**2, PowerLaw()),
-            offset_sd=file.offset_sd_n,
-        )
-        return term, ()
-
-
-def read_force(file: DataFile) -> ForceMeasurement:
-    """The force that a case states."""
-    return ForceMeasurement(file)
+        reaction, along = reaction_of(file.surface, direction), direction / np.linalg.norm(direction)
+        noise = stated_noise(file.sd_n, 1)
+        return Force(file.name, *noise, reaction, along, file.force_n, file.offset_sd_n), ()

@@ -17,18 +17,8 @@ from palpate.errors import InputDataError
 from palpate.findings import Finding
 from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.named_labels import printable
-from palpate.mesh.locate import located
-from palpate.mesh.space import LagrangeSpace
-from palpate.observation.contract import DataFile, ReactionOf
-from palpate.observation.measured_points import (
-    MeasuredPoints,
-    PointTable,
-    checked_table,
-    read_point_table,
-    read_text,
-    refuse_slips,
-)
-from palpate.observation.point_displacement import PointDisplacement, point_displacement
+from palpate.observation.contract import DataFile
+from palpate.observation.measured_points import MeasuredPoints, PointTable, checked_table, read_point_table, read_text
 
 Marks = list[tuple[str, NDArray[np.float64]]]  # labels and points, RAS mm, NaN of one that was not placed
 TO_RAS = {"LPS": LPS_TO_RAS, "RAS": np.ones(3), "1": LPS_TO_RAS, "0": np.ones(3)}
@@ -41,29 +31,19 @@ PLACED = ("2", "")  # behind the columns that a .fcsv of 3D Slicer 5 names: 0 un
 class Landmarks(MeasuredPoints):
     """Pairs of points, each of which counts by itself; implements `DataSource`."""
 
-    def on(self, space: LagrangeSpace, reaction_of: ReactionOf) -> tuple[PointDisplacement, tuple[Finding, ...]]:
-        """The term of the pairs that lie in the mesh; raises `InputDataError` where none does."""
-        del reaction_of
-        table, places = self.table, located(space.mesh, self.table.before)
-        refuse_slips(space, table.before, places.inside, self.file.paths[0])
-        inside, findings = places.inside, list(table.pairing)
-        names = [name or f"number {number}" for number, name in enumerate(table.names, start=1)]
-        if not inside.all():
-            text = (
-                f"{np.count_nonzero(~inside)} of {len(inside)} landmarks of '{self.file.paths[0].name}' lie outside of"
-                f" the meshed body and are left out: {_shown([names[i] for i in np.flatnonzero(~inside)])}"
-            )
-            findings.append(Finding("points-outside", text, place=f"in state {self.file.state}"))
-        term = point_displacement(
-            space,
-            table.before[inside],
-            table.moved[inside],
-            places.of(inside),
-            file=self.file,
-            description="the distance between landmarks of the model and where they were measured",
-            labels=tuple(names[i] for i in np.flatnonzero(inside)),
+    description = "the distance between landmarks of the model and where they were measured"
+
+    def named(self, inside: NDArray[np.bool_]) -> tuple[tuple[str, ...], tuple[Finding, ...]]:
+        """Names of the points inside the mesh, a mask (n,); those outside, and how the pairs were found, are told."""
+        names = np.array([name or f"number {number}" for number, name in enumerate(self.table.names, start=1)])
+        if inside.all():
+            return tuple(names.tolist()), self.table.pairing
+        text = (
+            f"{np.count_nonzero(~inside)} of {len(inside)} landmarks of '{self.file.paths[0].name}' lie outside of the"
+            f" meshed body and are left out: {_shown(names[~inside].tolist())}"
         )
-        return term, tuple(findings)
+        outside = Finding("points-outside", text, place=f"in state {self.file.state}")
+        return tuple(names[inside].tolist()), (*self.table.pairing, outside)
 
 
 def read_landmarks(file: DataFile) -> Landmarks:
@@ -73,31 +53,29 @@ def read_landmarks(file: DataFile) -> Landmarks:
     """
     if file.paths[0].suffix.lower() == ".csv" and len(file.paths) == 1:
         return Landmarks(file, read_point_table(file.paths[0]))
-    lists, digests = list[Marks](), []
+    lists, digests = list[Marks](), list[str]()
     for path in file.paths:
         content, digest = read_text(path)
-        reader = _fcsv if path.name.lower().endswith(".fcsv") else _markups
-        lists += reader(content, path)
+        lists += (_fcsv if path.name.lower().endswith(".fcsv") else _markups)(content, path)
         digests.append(digest)
     where = " and ".join(f"'{path.name}'" for path in file.paths)
     if len(lists) != 2:
         raise InputDataError(
-            f"{where} hold {len(lists)} list(s) of points; landmarks need two, before and after: name two files,"
-            " file and file_after"
+            f"{where} hold {len(lists)} list(s) of points; landmarks need two: name two files, file and file_after"
         )
-    labels = [[label for label, _ in own] for own in lists]
-    pairs = np.array(_pairs(labels[0], labels[1], where), dtype=np.int64).reshape(-1, 2)
-    points = np.array([[own[n][1] for own, n in zip(lists, pair, strict=True)] for pair in pairs]).reshape(-1, 2, 3)
-    placed = np.isfinite(points).all(axis=(1, 2))
+    first, second = ([label for label, _ in own] for own in lists)
+    before, after = (np.reshape([point for _, point in own], (-1, 3)) for own in lists)
+    pairs = np.reshape(_pairs(first, second, where), (-1, 2)).astype(np.int64)
+    pairs = pairs[np.isfinite(before[pairs[:, 0]] + after[pairs[:, 1]]).all(axis=1)]
     left = dict.fromkeys(
-        own[n] or f"number {n + 1}"
-        for own, used in zip(labels, pairs[placed].T, strict=True)
-        for n in np.setdiff1d(np.arange(len(own)), used)
+        labels[n] or f"number {n + 1}"
+        for labels, used in zip((first, second), pairs.T, strict=True)
+        for n in np.setdiff1d(np.arange(len(labels)), used)
     )
     text = f"{len(left)} landmarks of {where} are not placed in both lists, and are left out: {_shown(list(left))}"
     findings = (Finding("points-unpaired", text, place=f"in state {file.state}"),) if left else ()
-    names = tuple(labels[0][n] for n in pairs[placed, 0])
-    table = PointTable(points[placed, 0], points[placed, 1], names, tuple(digests), findings)
+    names = tuple(first[n] for n in pairs[:, 0])
+    table = PointTable(before[pairs[:, 0]], after[pairs[:, 1]], names, tuple(digests), findings)
     return Landmarks(file, checked_table(table, file.paths[0]))
 
 
@@ -120,8 +98,7 @@ def _pairs(first: Sequence[str], second: Sequence[str], where: str) -> list[tupl
         most = max(most, len(both))
     if most or len(first) != len(second):
         raise InputDataError(
-            f"{where} hold {len(first)} points before and {len(second)} after, of which {most} have a label that both"
-            " lists have once; give the two points of each landmark the same label"
+            f"{where} hold {len(first)} and {len(second)} points, {most} of one label; give each pair the same label"
         )
     return [(n, n) for n in range(len(first))]
 
@@ -134,9 +111,7 @@ def _markups(content: str, path: Path) -> list[Marks]:
             system = str(markup.get("coordinateSystem", "LPS")).upper()
             units = markup.get("coordinateUnits", "mm")  # a word, or a list of a code, its scheme and its meaning
             if system not in TO_RAS or (units[0] if isinstance(units, list) else units) != "mm":
-                raise InputDataError(
-                    f"'{path}' has coordinates in {system[:20]!r}, {str(units)[:20]!r}; export LPS or RAS in mm"
-                )
+                raise InputDataError(f"'{path}' is in {system[:20]!r}, {str(units)[:20]!r}; export LPS or RAS in mm")
             points = []
             for point in markup["controlPoints"]:
                 placed = point.get("positionStatus", "defined") == "defined" and point.get("position") is not None
@@ -145,8 +120,7 @@ def _markups(content: str, path: Path) -> list[Marks]:
             lists.append(points)
     except (ValueError, RecursionError, LookupError, TypeError, AttributeError) as error:
         raise InputDataError(
-            f"'{path}' is no markups file of 3D Slicer ({type(error).__name__}: {error}); landmarks are read from"
-            " .mrk.json, .fcsv and .csv"
+            f"'{path}' is no .mrk.json of 3D Slicer ({type(error).__name__}: {error}); export it again"
         ) from error
     return lists
 

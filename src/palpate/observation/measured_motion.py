@@ -21,16 +21,19 @@ EXACT = 1e-4  # of the motion's standard deviation: errors that are taken for no
 
 @dataclass(frozen=True, slots=True)
 class MeasuredMotion:
-    """Points before (n, 3) mm that moved by (n, 3) mm with errors of sd_mm (n,).
+    """The motion that the points of one state tell, those of one source or of several, with their stated errors.
 
     kernel_mm, amplitude_mm: of the Gaussian process that the motion is beside its affine part.
     """
 
-    before: NDArray[np.float64]
-    moved: NDArray[np.float64]
-    sd_mm: NDArray[np.float64]
+    sources: Sequence[MeasuredPoints]
     kernel_mm: float
     amplitude_mm: float
+
+    @property
+    def before(self) -> NDArray[np.float64]:
+        """The points (n, 3) mm at rest."""
+        return np.concatenate([source.table.before for source in self.sources])
 
     def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where points (m, 3) mm are afterwards, (m, 3) mm.
@@ -39,14 +42,16 @@ class MeasuredMotion:
         `NEAREST` points are asked (Rasmussen & Williams 2006, equation 2.23). Points on a plane, or a line, leave the
         map's slope across it at 0.
         """
-        mean = self.before.mean(axis=0)
-        terms = [np.concatenate([x - mean, np.ones((len(x), 1))], axis=1) for x in (self.before, points)]
-        slopes, *_ = np.linalg.lstsq(terms[0], self.moved, rcond=FLAT)
+        before, moved = self.before, np.concatenate([source.table.moved for source in self.sources])
+        sd_mm = np.concatenate([np.full(len(source.table.before), source.file.sd_mm) for source in self.sources])
+        mean = before.mean(axis=0)
+        terms = [np.concatenate([x - mean, np.ones((len(x), 1))], axis=1) for x in (before, points)]
+        slopes, *_ = np.linalg.lstsq(terms[0], moved, rcond=FLAT)
         process = RBFInterpolator(
-            self.before,
-            self.moved - terms[0] @ slopes,
-            neighbors=min(NEAREST, len(self.before)),
-            smoothing=np.maximum(self.sd_mm / self.amplitude_mm, EXACT) ** 2,
+            before,
+            moved - terms[0] @ slopes,
+            neighbors=min(NEAREST, len(before)),
+            smoothing=np.maximum(sd_mm / self.amplitude_mm, EXACT) ** 2,
             kernel="gaussian",
             epsilon=1.0 / (np.sqrt(2.0) * self.kernel_mm),
             degree=-1,
@@ -55,25 +60,12 @@ class MeasuredMotion:
 
     def require(self, points: NDArray[np.float64], name: str) -> None:
         """Raise `InputDataError` where points (m, 3) mm of a surface lie further than a kernel from all measured."""
-        distance = np.asarray(cKDTree(self.before).query(points)[0])
-        far = np.asarray(distance > self.kernel_mm)
-        if len(self.before) < FEWEST or far.any():
+        n, distance = len(self.before), np.asarray(cKDTree(self.before).query(points)[0])
+        far = np.count_nonzero(distance > self.kernel_mm)
+        if n < FEWEST or far:
             place = np.round(points[int(np.argmax(distance))], 1).tolist()
             raise InputDataError(
-                f"the motion of the surface '{name}' is prescribed by {len(self.before)} measured points, and"
-                f" {int(far.sum())} of its {len(points)} nodes lie further than {self.kernel_mm:g} mm ([driver]"
-                f" kernel_mm) from all of them, the farthest {distance.max():.3g} mm, at {place} mm; measure {FEWEST}"
+                f"'{name}' is prescribed by {n} measured points, and {far} of its {len(points)} nodes lie further than"
+                f" {self.kernel_mm:g} mm ([driver] kernel_mm) from all, the farthest at {place} mm; measure {FEWEST}"
                 ' points or more beside it, or give it the boundary "moving"'
             )
-
-
-def measured_motion(sources: Sequence[MeasuredPoints], *, kernel_mm: float, amplitude_mm: float) -> MeasuredMotion:
-    """The motion that sources of one state, one or more, tell together."""
-    sd = [np.full(len(source.table.before), source.file.sd_mm) for source in sources]
-    return MeasuredMotion(
-        np.concatenate([source.table.before for source in sources]),
-        np.concatenate([source.table.moved for source in sources]),
-        np.concatenate(sd),
-        kernel_mm,
-        amplitude_mm,
-    )

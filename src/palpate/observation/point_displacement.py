@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,102 +10,42 @@ from scipy import sparse
 
 from palpate.mesh.locate import Places, point_interpolation
 from palpate.mesh.space import LagrangeSpace
-from palpate.observation.contract import DataFile, Fit, PointMotions, Residuals, Weighting
-from palpate.observation.noise_model import FitResponse, NoiseModel, whitener
-from palpate.observation.robust_loss import FAR, PowerLaw
+from palpate.observation.contract import DataFile, PointMotions, Residuals
+from palpate.observation.noise_model import whitener
+from palpate.observation.stated_noise import StatedNoise, stated_noise
 
-MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
-ALONE = 1e-3  # mm: length over which errors that are independent are alike
-FEW = 30  # residuals, of which a spread is not told
 TOGETHER = 6  # points of one cell whose mean is compared, of errors that are alike
 
 
 @dataclass(frozen=True, slots=True)
-class PointDisplacement:
+class PointDisplacement(StatedNoise):
     """Residuals r = W (N u - d) of points with measured displacements d; implements `Observation`.
 
     interpolation: N (n, n_dofs) to the points, or to means of several; measured: d (n,) mm; whitening: W (n, n), which
     makes their errors independent, each with the standard deviation stated. material (n, 3) mm: the point that a
-    residual is of; axes (n, 3): along which; labels (n / 3,): names of the points, () where they have none.
+    residual is of, along x, y or z in turn; labels (n / 3,): names of the points, () where they have none.
     """
 
-    kind: str
     description: str
-    name: str
     dofs: NDArray[np.int64]
     interpolation: sparse.csr_matrix[np.float64]
     measured: NDArray[np.float64]
     whitening: sparse.csr_matrix[np.float64]
     material: NDArray[np.float64]
-    axes: NDArray[np.float64]
-    observed_share: float
-    stated: NoiseModel
-    noise_model: NoiseModel
-    weighting: Weighting
     labels: tuple[str, ...] = ()
 
-    @property
-    def unit(self) -> str:
-        """Millimetre."""
-        return "mm"
-
-    @property
-    def of_driver(self) -> bool:
-        """It shows no wall."""
-        return False
+    unit = "mm"
 
     def residuals(self, displacement: NDArray[np.float64], offset: float = 0.0) -> Residuals:
         """Residuals and their derivative at displacements (n,) mm of the points; linear, and without an `offset`."""
-        n = len(self.measured)
-        values = np.asarray(self.whitening @ (displacement - self.measured)) + offset
-        weights = np.full(n, 1.0 / n)
-        motions = self.point_motions(displacement)
-        away = np.linalg.norm(motions.fitted - motions.observed, axis=1)
-        return Residuals(values, weights, self.material, self.axes, self.material, self.whitening, away)
+        n, off = len(self.measured), displacement - self.measured
+        values, weights = np.asarray(self.whitening @ off) + offset, np.full(n, 1.0 / n)
+        away, axes = np.linalg.norm(off.reshape(-1, 3), axis=1), np.tile(np.eye(3), (n // 3, 1))
+        return Residuals(values, weights, self.material, axes, self.material, self.whitening, away)
 
     def point_motions(self, displacement: NDArray[np.float64]) -> PointMotions:
         """The points, or means of some, as measured and at their displacements (n,) mm."""
         return PointMotions(self.material[::3], self.measured.reshape(-1, 3), displacement.reshape(-1, 3), self.labels)
-
-    def with_noise(self, noise: NoiseModel) -> PointDisplacement:
-        """All points count, by the variance of the noise."""
-        n = float(len(self.measured))
-        return replace(self, noise_model=noise, weighting=Weighting(n / noise.sd**2, PowerLaw(), n))
-
-    @property
-    def sd_bounds(self) -> tuple[float, float]:
-        """From what is stated on."""
-        return self.stated.sd, np.inf if len(self.measured) >= FEW else self.stated.sd
-
-    def with_sd(self, sd: float) -> PointDisplacement:
-        """The same; a point that was mistaken for another counts less, the further off it is."""
-        n = self.weighting.count
-        return replace(self, weighting=Weighting(n / sd**2, PowerLaw(FAR * sd), n))
-
-    def with_correlation(self, noise: NoiseModel) -> PointDisplacement:
-        """The same noise: its residuals are independent."""
-        return replace(self, noise_model=noise)
-
-    def weighed(self, residuals: Residuals) -> Residuals:
-        """The same: every residual counts alike."""
-        return residuals
-
-    def first_noise(self, peers: Sequence[PointDisplacement]) -> NoiseModel:
-        """What is stated."""
-        del peers
-        return self.stated
-
-    def fitted_noise(self, residuals: Sequence[Residuals], response: FitResponse | None = None) -> NoiseModel:
-        """What is stated, or the residuals' robust spread where that is larger."""
-        del response
-        every = np.concatenate([found.values for found in residuals])
-        spread = MAD * float(np.median(np.abs(every))) if len(every) >= FEW else 0.0
-        return self.stated if spread <= self.stated.sd else NoiseModel(np.array([spread**2]), self.stated.lengths)
-
-    def fit(self, residuals: Residuals) -> Fit:
-        """Distances of the model's points to where they were measured."""
-        away = np.abs(residuals.values) if residuals.distances is None else residuals.distances
-        return Fit(float(away.mean()), float(np.sqrt(np.mean(away**2))), float(np.quantile(away, 0.95)), None)
 
 
 def point_displacement(
@@ -114,9 +53,9 @@ def point_displacement(
     points: NDArray[np.float64],
     moved: NDArray[np.float64],
     places: Places,
-    *,
     file: DataFile,
     description: str,
+    *,
     cells: NDArray[np.int64] | None = None,
     labels: tuple[str, ...] = (),
 ) -> PointDisplacement:
@@ -132,21 +71,15 @@ def point_displacement(
     apart = np.eye(3)
     if file.covariance_mm2 is not None:
         apart = file.sd_mm * np.linalg.inv(np.linalg.cholesky(file.covariance_mm2))
-    stated = NoiseModel(np.array([file.sd_mm**2]), np.array([ALONE]))
     return PointDisplacement(
-        kind=file.name,
+        file.name,
+        *stated_noise(file.sd_mm, 3 * n),
         description=description,
-        name=file.name,
         dofs=(3 * seen[:, None] + np.arange(3)).ravel(),
         interpolation=sparse.csr_matrix(sparse.kron(of_nodes[:, seen], sparse.eye_array(3))),
         measured=np.asarray(mean @ moved).ravel(),
         whitening=sparse.csr_matrix(sparse.kron(mixed, apart)),
         material=np.repeat(np.asarray(mean @ points), 3, axis=0),
-        axes=np.tile(np.eye(3), (n, 1)),
-        observed_share=1.0,
-        stated=stated,
-        noise_model=stated,
-        weighting=Weighting(3.0 * n / file.sd_mm**2, PowerLaw(), 3.0 * n),
         labels=labels,
     )
 

@@ -13,7 +13,7 @@ from itertools import chain
 from palpate.entry_points import brought
 from palpate.observation.contract import DataFile, DataSource, ImagedBody, Observation
 from palpate.observation.displacement_field import read_displacement_field
-from palpate.observation.force import read_force
+from palpate.observation.force import ForceMeasurement
 from palpate.observation.landmarks import read_landmarks
 from palpate.observation.surface_distance import surface_distances
 
@@ -36,7 +36,9 @@ class SourceKind:
 SOURCES = {
     "landmarks": SourceKind(read_landmarks),
     "displacement-field": SourceKind(read_displacement_field),
-    "force": SourceKind(read_force, ("surface", "force_n", "direction", "sd_n"), ("offset_sd_n",), tells_scale=True),
+    "force": SourceKind(
+        ForceMeasurement, ("surface", "force_n", "direction", "sd_n"), ("offset_sd_n",), tells_scale=True
+    ),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -15,6 +16,17 @@ from palpate.study.schema import rule
 Row = tuple[float, float, float]
 FORCES_N = (-1e9, 1e9)
 STRESSES_KPA = (-1e4, 1e4)
+KEYS_OF_LOADS = {
+    "pressure": ("surface", "pressure_kpa"),
+    "traction": ("surface", "traction_kpa"),
+    "gravity": ("acceleration_m_s2",),
+}
+DIRECTION = rule(between=(-1e3, 1e3), test=any, wanted="the way that the force acts, not (0, 0, 0)")
+COVARIANCE = rule(
+    instead_of="sd_mm",
+    test=lambda rows: np.allclose(rows, np.transpose(rows)) and np.linalg.eigvalsh(rows)[0] > 0.0,
+    wanted="a symmetric and positive definite matrix, mm^2",
+)
 register_brought()  # before the words that a case may use are listed
 
 
@@ -33,38 +45,22 @@ class CaseData:
     file_after: Path | None = None
     state: int = field(default=1, metadata=rule(between=(1, 1000)))
     sd_mm: float | None = field(default=None, metadata=rule(between=(1e-6, 100.0)))
-    covariance_mm2: tuple[Row, Row, Row] | None = field(default=None, metadata=rule(instead_of="sd_mm"))
+    covariance_mm2: tuple[Row, Row, Row] | None = field(default=None, metadata=COVARIANCE)
     correlation_mm: float = field(default=0.0, metadata=rule(between=(0.0, 1e3)))
     axes: str | None = field(default=None, metadata=rule(choices=("LPS", "RAS")))
     surface: str | None = None
     force_n: float | None = field(default=None, metadata=rule(between=FORCES_N))
-    direction: Row | None = field(default=None, metadata=rule(between=(-1e3, 1e3)))
+    direction: Row | None = field(default=None, metadata=DIRECTION)
     sd_n: float | None = field(default=None, metadata=rule(between=(1e-9, 1e6)))
     offset_sd_n: float = field(default=0.0, metadata=rule(between=(0.0, 1e6)))
 
     def __post_init__(self) -> None:
         kind = SOURCES[self.kind]
-        missing = [key for key in kind.needs if getattr(self, key) is None]
-        if missing:
-            raise ConfigurationError(f"[[data]]: a {self.kind} needs the key '{missing[0]}'")
-        allowed = {"kind", "state", *kind.needs, *kind.may_have}
-        for item in fields(self):
-            if item.name not in allowed and getattr(self, item.name) != item.default:
-                known = " and ".join((*kind.needs, *kind.may_have))
-                raise ConfigurationError(f"[[data]]: a {self.kind} has no '{item.name}'; it has {known}")
-        if self.direction is not None and not any(self.direction):
-            raise ConfigurationError("[[data]] direction is (0, 0, 0), which is none; give the way that the force acts")
+        _check_keys(self, "[[data]]", kind.needs, kind.may_have)
         if self.file is not None and self.sd_mm is None and self.covariance_mm2 is None:
             raise ConfigurationError(
-                f"[[data]] '{self.file.name}' says nothing of its errors: give sd_mm, the standard deviation of each"
-                " component (mm), by which it counts beside the images"
+                f"[[data]] '{self.file.name}' says nothing of its errors: give sd_mm, that of a component in mm"
             )
-        if self.covariance_mm2 is not None:
-            matrix = np.array(self.covariance_mm2)
-            if not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix)[0] <= 0.0:
-                raise ConfigurationError(
-                    f"[[data]] covariance_mm2 is {matrix.tolist()}; it must be symmetric and positive definite, mm^2"
-                )
 
     @property
     def tells_scale(self) -> bool:
@@ -76,21 +72,9 @@ class CaseData:
         matrix = None if self.covariance_mm2 is None else np.array(self.covariance_mm2)
         paths = tuple(path for path in (self.file, self.file_after) if path is not None)
         sd_mm = self.sd_mm or float(np.sqrt(np.trace(np.eye(3) if matrix is None else matrix) / 3.0))
-        return DataFile(
-            self.kind,
-            name,
-            paths,
-            self.state,
-            sd_mm,
-            matrix,
-            self.correlation_mm,
-            self.axes or "",
-            self.surface or "",
-            self.force_n or 0.0,
-            self.direction or (0.0, 0.0, 1.0),
-            self.sd_n or 1.0,
-            self.offset_sd_n,
-        )
+        errors = (sd_mm, matrix, self.correlation_mm, self.axes or "")
+        force = (self.surface or "", self.force_n or 0.0, self.direction or (0.0, 0.0, 1.0), self.sd_n or 1.0)
+        return DataFile(self.kind, name, paths, self.state, *errors, *force, self.offset_sd_n)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +88,7 @@ class CaseLoad:
     0: it acts in the reference state, whose shape the images, or the mesh, show under it.
     """
 
-    kind: str = field(metadata=rule(choices=("pressure", "traction", "gravity")))
+    kind: str = field(metadata=rule(choices=tuple(KEYS_OF_LOADS)))
     state: int | None = field(default=None, metadata=rule(between=(0, 1000)))
     surface: str | None = None
     pressure_kpa: float | None = field(default=None, metadata=rule(between=STRESSES_KPA))
@@ -115,29 +99,26 @@ class CaseLoad:
     @property
     def taken(self) -> CaseLoad:
         """What takes the load off a body that bears it: its forces, turned round."""
+        pressure = None if self.pressure_kpa is None else -self.pressure_kpa
+        traction, acceleration = _turned(self.traction_kpa), _turned(self.acceleration_m_s2)
         return replace(
-            self,
-            following=False,
-            pressure_kpa=None if self.pressure_kpa is None else -self.pressure_kpa,
-            traction_kpa=_turned(self.traction_kpa),
-            acceleration_m_s2=_turned(self.acceleration_m_s2),
+            self, following=False, pressure_kpa=pressure, traction_kpa=traction, acceleration_m_s2=acceleration
         )
 
     def __post_init__(self) -> None:
-        needed = {
-            "pressure": ("surface", "pressure_kpa"),
-            "traction": ("surface", "traction_kpa"),
-            "gravity": ("acceleration_m_s2",),
-        }[self.kind]
-        keys = ("surface", "pressure_kpa", "traction_kpa", "acceleration_m_s2")
-        given = [key for key in keys if getattr(self, key) is not None]
-        for key in needed:
-            if key not in given:
-                raise ConfigurationError(f"[[loads]]: a {self.kind} needs the key '{key}'")
-        for key in given:
-            if key not in needed:
-                raise ConfigurationError(f"[[loads]]: a {self.kind} has no '{key}'; it has {' and '.join(needed)}")
+        _check_keys(self, "[[loads]]", KEYS_OF_LOADS[self.kind], ("following",))
 
 
 def _turned(vector: Row | None) -> Row | None:
     return None if vector is None else (-vector[0], -vector[1], -vector[2])
+
+
+def _check_keys(stated: CaseData | CaseLoad, table: str, needs: Sequence[str], may_have: Sequence[str]) -> None:
+    """Raise `ConfigurationError` where a key that its kind needs is missing, or another kind's is given."""
+    for item in fields(stated):
+        value = getattr(stated, item.name)
+        if item.name in needs and value is None:
+            raise ConfigurationError(f"{table}: a {stated.kind} needs the key '{item.name}'")
+        if item.name not in ("kind", "state", *needs, *may_have) and value != item.default:
+            known = " and ".join((*needs, *may_have))
+            raise ConfigurationError(f"{table}: a {stated.kind} has no '{item.name}'; it has {known}")

@@ -22,7 +22,7 @@ from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.mesh.voxelise import voxelise
-from palpate.observation.measured_motion import measured_motion
+from palpate.observation.measured_motion import MeasuredMotion
 from palpate.observation.measured_points import MeasuredPoints
 from palpate.progress import Progress
 from palpate.study.case import Case
@@ -45,17 +45,21 @@ def mesh_states(body: MeshBody, case: Case, *, progress: Progress) -> ImagedStat
     progress(f"'{body.mesh.name}': {len(file.tets)} tetrahedra, {len(file.nodes)} nodes")
     findings = _findings(file, case)
     mesh = _mesh(file, case)
-    # voxels that show the mesh: some along an edge, and a border around
+    grid = _grid_around(mesh)
+    index = voxelise(lagrange_space(mesh, "P1"), np.zeros_like(mesh.nodes), grid, crossing=True)
+    bones = tuple(dict[int, Motion]() for _ in range(case.n_states))
+    before = Segmentation(index, grid, mesh.tissues)
+    return ImagedStates(before, (), bones, findings, inputs={"mesh": file.digest}, mesh=mesh)
+
+
+def _grid_around(mesh: TetMesh) -> VoxelGrid:
+    """Voxels that show the mesh: some along an edge, and a border around."""
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     size = max(mesh.usual_edge_mm / VOXELS_AN_EDGE, float(np.cbrt(np.prod(high - low) / MOST_VOXELS)))
-    shape = np.ceil((high - low) / size).astype(int) + 2 * BORDER
+    n_x, n_y, n_z = (np.ceil((high - low) / size).astype(int) + 2 * BORDER).tolist()
     affine = np.diag([size, size, size, 1.0])
-    affine[:3, 3] = 0.5 * (low + high) - 0.5 * size * (shape - 1)
-    grid = VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
-    index = voxelise(lagrange_space(mesh, "P1"), np.zeros_like(mesh.nodes), grid, crossing=True)
-    before = Segmentation(index, grid, mesh.tissues)
-    bones = tuple(dict[int, Motion]() for _ in range(case.n_states))
-    return ImagedStates(before, (), bones, findings, inputs={"mesh": file.digest}, mesh=mesh)
+    affine[:3, 3] = 0.5 * (low + high) - 0.5 * size * (np.array([n_x, n_y, n_z]) - 1)
+    return VoxelGrid((n_x, n_y, n_z), affine)
 
 
 def with_prescribed(states: ImagedStates, case: Case) -> ImagedStates:
@@ -72,10 +76,9 @@ def with_prescribed(states: ImagedStates, case: Case) -> ImagedStates:
         points = [of for of in states.data if isinstance(of, MeasuredPoints) and of.file.state == state]
         if not points:
             raise ConfigurationError(
-                f"the motion of '{surfaces[0]}' is prescribed, and no [[data]] of state {state} says where points went:"
-                ' give landmarks or a displacement field, or the surface another boundary ("moving", "fixed")'
+                f"'{surfaces[0]}' is prescribed, and no [[data]] of state {state} says where points went; measure some"
             )
-        motion = measured_motion(points, kernel_mm=case.driver.kernel_mm, amplitude_mm=case.driver.prior_mm)
+        motion = MeasuredMotion(points, case.driver.kernel_mm, case.driver.prior_mm)
         for name in surfaces:
             motion.require(mesh.nodes[np.unique(boundary_named(mesh, name))], name)
         found.append({names.index(name): motion for name in surfaces})
@@ -92,8 +95,7 @@ def _findings(file: MeshFile, case: Case) -> tuple[Finding, ...]:
         if wide:
             raise InputDataError(f"{text}; else make within_mm of '{wide[0]}' smaller, which takes all of the mesh")
         found.append(Finding("units", text))
-    count = np.bincount(file.piece)
-    if len(count) > 1:
+    if len(count := np.bincount(file.piece)) > 1:
         place = np.round(file.nodes[file.tets[file.piece == count.argmin()]].mean(axis=(0, 1)), 1).tolist()
         text = (
             f"the mesh has {len(count)} pieces that share no face, the largest of {count.max()} tetrahedra, the"
@@ -109,16 +111,13 @@ def _mesh(file: MeshFile, case: Case) -> TetMesh:
     tissues = (*solid, *(surface.behind for surface in case.surfaces), Tissue(OUTSIDE, Role.VOID))
     faces, surfaces, grouped = boundary_of(file.tets), dict[str, NDArray[np.bool_]](), dict[str, NDArray[np.bool_]]()
     for surface in case.surfaces:
-        group = _group(surface.where, file.surfaces)
-        if group is not None:
+        if (group := _group(surface.where, file.surfaces)) is not None:
             found = grouped[surface.name] = listed_faces(faces, group, surface.where)
         elif surface.where in (WHOLE, *PLANES):
             found = plane_faces(file.nodes, faces, surface.where, surface.within_mm)
         else:
             known = nearest(surface.where, [WHOLE, *PLANES, *map(str, file.surfaces)])
-            raise ConfigurationError(
-                f"[[surfaces]] '{surface.name}': the mesh has no surface '{surface.where}': {known}"
-            )
+            raise ConfigurationError(f"the mesh has no surface '{surface.where}' for '{surface.name}': {known}")
         surfaces[surface.name] = found
     behind = tissues_behind(surfaces, tuple(grouped), tissues, len(faces))
     return TetMesh(file.nodes, file.tets, region, faces, behind, tissues, grouped)
@@ -126,33 +125,26 @@ def _mesh(file: MeshFile, case: Case) -> TetMesh:
 
 def _regions(file: MeshFile, case: Case) -> tuple[list[Tissue], NDArray[np.int64]]:
     """The case's tissues and which one (n_tets,) each tetrahedron is of; `ConfigurationError` unless it is one."""
-    labels = [stated.label for stated in case.tissues]
-    tissues = [
-        stated.with_labels(label if isinstance(label, tuple) else ())
-        for stated, label in zip(case.tissues, labels, strict=True)
-    ]
-    region = np.full(len(file.tets), -1)
-    for number in sorted(range(len(tissues)), key=lambda n: labels[n] == REMAINING):
+    tissues = [stated.with_labels(stated.label if isinstance(stated.label, tuple) else ()) for stated in case.tissues]
+    region, last = np.full(len(file.tets), -1), [stated.label == REMAINING for stated in case.tissues]
+    for number in np.argsort(last, kind="stable").tolist():
         tissue = tissues[number]
         if not tissue.meshed:
             raise ConfigurationError(
-                f"tissue '{tissue.name}' has the role {tissue.role}, but a mesh holds solid ones alone: name hollow"
-                " spaces and what moves as [[surfaces]]"
+                f"tissue '{tissue.name}' is {tissue.role}, and a mesh holds solid ones alone: name it in [[surfaces]]"
             )
-        own = np.flatnonzero(region < 0) if labels[number] == REMAINING else _tets(file, case.tissues[number])
+        own = np.flatnonzero(region < 0) if last[number] else _tets(file, case.tissues[number])
         if not len(own):
             raise ConfigurationError(f"tissue '{tissue.name}' has no tetrahedron: the others have all; leave it out")
-        twice = region[own[region[own] >= 0]]
-        if len(twice):
+        if len(twice := region[own[region[own] >= 0]]):
             both = f"'{tissues[twice[0]].name}' and '{tissue.name}'"
             raise ConfigurationError(f"{len(twice)} tetrahedra are in groups of {both}; give each to one tissue")
         region[own] = number
-    left = np.flatnonzero(region < 0)
-    if len(left):
+    if len(left := np.flatnonzero(region < 0)):
         groups = sorted(str(name) for name, own in file.groups.items() if np.isin(own, left).any())
         raise ConfigurationError(
-            f"no tissue of the case has {len(left)} of the tetrahedra, which are in the group(s) {groups} of the mesh;"
-            ' give each a tissue, or one label = "remaining"'
+            f"no tissue of the case has {len(left)} of the tetrahedra, which are in the group(s) {groups}; give them"
+            ' one, or the label "remaining"'
         )
     return tissues, region
 
@@ -161,8 +153,7 @@ def _tets(file: MeshFile, stated: CaseTissue) -> NDArray[np.int64]:
     """The tetrahedra of the groups that a tissue names."""
     found = list[NDArray[np.int64]]()
     for label in stated.label if isinstance(stated.label, tuple) else (stated.label,):
-        group = _group(label, file.groups)
-        if group is None:
+        if (group := _group(label, file.groups)) is None:
             known = f"its groups: {nearest(str(label), map(str, file.groups))}" if file.groups else "it has no groups"
             raise ConfigurationError(
                 f"tissue '{stated.name}' has no tetrahedron: the mesh has no group {shown(label)}; {known}"

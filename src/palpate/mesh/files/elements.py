@@ -2,47 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import InputDataError
-
 MOST_BYTES = 4 * 2**30
+CORNERS = {"tetra": 4, "tetra10": 4, "triangle": 3, "triangle6": 3, "node": 1}  # of what is read; the last is of sets
 Name = int | str
 Numbers = NDArray[np.int64]
-Sets = Mapping[Name, Sequence[Numbers]]
+Block = tuple[str, Numbers, Collection[Name]]
 
 
 @dataclass(frozen=True, slots=True)
 class Elements:
-    """Points (n, 3); blocks of elements of one kind, in meshio's words, (n, k) numbers of points, corners first.
+    """Points (n, 3), and blocks: kind in meshio's words, numbers (n, k) of points, corners first, and groups.
 
-    sets: elements, counted through all blocks, by the name or the number of their set, in one or several parts;
-    point_sets: points. about: what else the file says of groups.
+    All elements of a block are in its groups, which have a name or a number; one that is in others may stand in further
+    blocks. about: what else the file says of groups.
     """
 
     points: NDArray[np.float64]
-    blocks: Sequence[tuple[str, Numbers]]
-    sets: Sets = field(default_factory=dict)
-    point_sets: Sets = field(default_factory=dict)
+    blocks: Sequence[Block]
     about: str = ""
-
-    def of(self, kinds: Sequence[str], corners: int) -> tuple[Numbers, Numbers]:
-        """Corners (n, corners) of the elements of some kinds, and the number (n,) of each."""
-        firsts = np.cumsum([0, *(len(rows) for _, rows in self.blocks)])
-        chosen = [(rows[:, :corners], n) for n, (kind, rows) in zip(firsts, self.blocks, strict=False) if kind in kinds]
-        rows = np.concatenate([np.zeros((0, corners), dtype=np.int64), *(rows for rows, _ in chosen)])
-        numbers = [first + np.arange(len(own)) for own, first in chosen]
-        return rows.astype(np.int64), np.concatenate([np.zeros(0, dtype=np.int64), *numbers])
-
-
-def places(numbers: Numbers, wanted: Numbers, of: str) -> Numbers:
-    """Where each of the `wanted` (...) stands in `numbers` (n,), from 0; raises `InputDataError` where one does not."""
-    missing = np.setdiff1d(wanted, numbers)
-    if len(missing):
-        raise InputDataError(f"it names {len(missing)} {of} that it has not, the first of the number {missing[0]}")
-    order = np.argsort(numbers, kind="stable")
-    return np.asarray(order[np.searchsorted(numbers, wanted, sorter=order)])

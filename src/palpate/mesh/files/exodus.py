@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-from collections import defaultdict
 from importlib import import_module
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from scipy.io import netcdf_file
 
 from palpate.errors import InputDataError
-from palpate.mesh.files.elements import MOST_BYTES, Elements, Name, Numbers
+from palpate.mesh.files.elements import CORNERS, MOST_BYTES, Block, Elements, Name
 
 WANTED = re.compile(r"coord[xyz]?$|connect\d+$|(eb|ss|ns)_(prop1|names)$|(elem|side)_ss\d+$|node_ns\d+$")
 SIDES = np.array([[0, 1, 3], [1, 2, 3], [0, 3, 2], [0, 2, 1]])
@@ -24,34 +23,24 @@ def read_exodus(content: bytes, _: str | None) -> Elements:
     """Elements with the blocks, side sets and node sets; raises `InputDataError` for what is no such file."""
     found, kinds = _variables(content)
     axes = [found[f"coord{axis}"] for axis in "xyz"] if "coordx" in found else found["coord"]
-    blocks, first = list[tuple[str, Numbers]](), 0
-    sets, point_sets = defaultdict[Name, list[Numbers]](list), defaultdict[Name, list[Numbers]](list)
-
-    def add(kind: str, rows: Numbers, names: set[Name]) -> None:
-        nonlocal first
-        blocks.append((kind, rows))
-        for name in names:
-            sets[name].append(first + np.arange(len(rows)))
-        first += len(rows)
-
+    blocks, corners = list[Block](), [np.zeros((0, 4), dtype=np.int64)]
     for number, names in _named(found, "eb"):
         rows = found.get(f"connect{number}", np.ones((0, 1))).astype(np.int64) - 1
         start = kinds.get(f"connect{number}", "").upper()[:3]
         other = "line" if start in HOLLOW else f"{start} of {rows.shape[1]} nodes"
-        add(KINDS.get((start, rows.shape[1]), other), rows, names)
-    tets = np.full((first, 4), -1)  # of elements that are none
-    rows, own = Elements(np.zeros((0, 3)), blocks).of(("tetra", "tetra10"), 4)
-    tets[own] = rows
+        blocks.append((KINDS.get((start, rows.shape[1]), other), rows, names))
+        n = CORNERS.get(blocks[-1][0], 0)
+        corners.append(np.pad(rows[:, :n], ((0, 0), (0, 4 - n)), constant_values=-1))
+    every = np.concatenate(corners)
     for number, names in _named(found, "ss"):
         elements, sides = (found[f"{of}_ss{number}"].astype(np.int64) - 1 for of in ("elem", "side"))
-        solid = tets[elements, 0] >= 0
-        add("triangle", np.take_along_axis(tets[elements[solid]], SIDES[sides[solid]], axis=1), names)
-        for name in names:
-            sets[name].append(elements[~solid])
+        of_sides = every[elements]
+        solid, shell = of_sides[:, 3] >= 0, (of_sides[:, 0] >= 0) & (of_sides[:, 3] < 0)
+        blocks.append(("triangle", np.take_along_axis(of_sides[solid], SIDES[sides[solid]], axis=1), names))
+        blocks.append(("triangle", of_sides[shell, :3], names))
     for number, names in _named(found, "ns"):
-        for name in names:
-            point_sets[name].append(found.get(f"node_ns{number}", np.ones(0)).astype(np.int64) - 1)
-    return Elements(np.stack([np.asarray(axis, dtype=float) for axis in axes], axis=1), blocks, sets, point_sets)
+        blocks.append(("node", found.get(f"node_ns{number}", np.ones(0)).astype(np.int64)[:, None] - 1, names))
+    return Elements(np.stack([np.asarray(axis, dtype=float) for axis in axes], axis=1), blocks)
 
 
 def _named(found: dict[str, Any], of: str) -> list[tuple[int, set[Name]]]:
@@ -70,7 +59,6 @@ def _variables(content: bytes) -> tuple[dict[str, Any], dict[str, str]]:
         wanted = {name: data for name, data in getattr(file, "variables", file).items() if WANTED.match(name)}
         if sum(8.0 * np.prod(data.shape) for data in wanted.values()) > MOST_BYTES:
             raise InputDataError(f"its arrays have over {MOST_BYTES / 2**30:.0f} GB")
-        attributes = {name: data if classic else data.attrs for name, data in wanted.items()}
+        kinds = {name: (vars(data) if classic else data.attrs).get("elem_type", b"") for name, data in wanted.items()}
         arrays = {name: np.array(data[:]) for name, data in wanted.items()}
-        kinds = {n: getattr(a, "elem_type", b"") if classic else a.get("elem_type", b"") for n, a in attributes.items()}
     return arrays, {name: kind.decode() if isinstance(kind, bytes) else str(kind) for name, kind in kinds.items()}
