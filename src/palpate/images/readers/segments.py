@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, hex_colour, printable
+from palpate.images.named_labels import MAX_LABEL, NamedLabel, given_name, hex_colour, printable
 from palpate.images.readers.text_header import numbers_in
 
 KEY = re.compile(r"Segment([0-9]{1,5})_(ID|Name|Color|LabelValue|Layer)")
@@ -42,37 +42,29 @@ def segments_of(keys: Mapping[str, str], path: Path) -> tuple[Segment, ...]:
         match = KEY.fullmatch(key)
         if match:
             found.setdefault(int(match[1]), {})[match[2]] = value
-    described = [
-        (number, entry) for number, entry in sorted(found.items()) if {"ID", "Name", "LabelValue"} & set(entry)
-    ]
+    described = [(number, entry) for number, entry in sorted(found.items()) if {"ID", "Name", "LabelValue"} & {*entry}]
     old = not any("Layer" in entry or "LabelValue" in entry for _, entry in described)
     segments = []
     for number, entry in described:
-        name = printable(entry.get("Name", "").strip())[:MAX_NAME] or f"segment {number + 1}"
+        name = given_name(entry.get("Name", ""), f"segment {number + 1}")
         layer = number if old else _whole(entry.get("Layer", "0"), path, low=0)
         label = _whole(entry.get("LabelValue", "1"), path, low=1)
         segments.append(Segment(name, unit_colour(entry.get("Color", "").split()), layer, label))
     if len({(s.layer, s.label) for s in segments}) < len(segments):
-        raise InputDataError(
-            f"'{path}' has two segments with the same label value in one layer, so one of them is lost; export the"
-            " segmentation again"
-        )
+        raise InputDataError(f"'{path}' has two segments of the same label value in one layer; export it again")
     return tuple(segments)
 
 
 def unit_colour(words: Sequence[str]) -> str | None:
     """Colour #rrggbb of three numbers from 0 to 1; None where they are anything else."""
-    parts = numbers_in(words)
-    return hex_colour(*parts, top=1.0) if len(parts) == 3 else None
+    return hex_colour(numbers_in(words), top=1.0)
 
 
 def _whole(text: str, path: Path, *, low: int) -> int:
     text = text.strip()
     if not (text.isascii() and text.isdigit() and len(text) <= 6 and low <= int(text) <= MAX_LABEL):
-        raise InputDataError(
-            f"'{path}' has a segment with the label value or layer '{printable(text[:30])}'; it must be a whole number"
-            f" from {low} to {MAX_LABEL}: export the segmentation again"
-        )
+        flaw = f"a segment with the label value or layer '{printable(text[:30])}', no whole number from {low}"
+        raise InputDataError(f"'{path}' has {flaw} to {MAX_LABEL}; export the segmentation again")
     return int(text)
 
 
@@ -86,39 +78,34 @@ def flattened(
     """
     beyond = [s.name for s in segments if s.layer >= len(layers)]
     if beyond:
-        raise InputDataError(
-            f"'{path}' has {len(layers)} layers, but the segments {beyond[:5]} are in others; export it again"
-        )
+        flaw = f"{len(layers)} layers, but the segments {beyond[:5]} are in others"
+        raise InputDataError(f"'{path}' has {flaw}; export it again")
     unique = len({s.label for s in segments}) == len(segments)
-    labels = [s.label if unique else number for number, s in enumerate(segments, start=1)]
-    names = tuple(NamedLabel(label, s.name, s.colour) for label, s in zip(labels, segments, strict=True))
+    names = tuple(NamedLabel(s.label if unique else k, s.name, s.colour) for k, s in enumerate(segments, start=1))
     if len(layers) == 1:
         return layers[0], names
     merged = np.zeros(layers.shape[1:], dtype=np.uint16)
     for k, layer in enumerate(layers):
         if layer.dtype.kind not in "iu" or layer.min() < 0 or layer.max() > MAX_LABEL:
-            raise InputDataError(
-                f"the layers of '{path}' hold values that are no labels from 0 to {MAX_LABEL}; export it again"
-            )
+            flaw = f"hold values that are no labels from 0 to {MAX_LABEL}"
+            raise InputDataError(f"the layers of '{path}' {flaw}; export it again")
         table = np.zeros(MAX_LABEL + 1, dtype=np.uint16)
-        for s, label in zip(segments, labels, strict=True):
+        for s, row in zip(segments, names, strict=True):
             if s.layer == k:
-                table[s.label] = label
-        mapped = np.asarray(table[layer])
-        lost = (mapped == 0) & (layer > 0)
-        if lost.any():
+                table[s.label] = row.label
+        mapped = table[layer]
+        lost = np.count_nonzero((mapped == 0) & (layer > 0))
+        if lost:
             raise InputDataError(
-                f"'{path}' has {np.count_nonzero(lost)} voxels that belong to no segment of their layer; export it"
-                " again"
+                f"'{path}' has {lost} voxels that belong to no segment of their layer; export it again"
             )
         both = (merged > 0) & (mapped > 0)
         if both.any():
-            where = tuple(np.argwhere(both)[0])
-            by_label = {label: s.name for s, label in zip(segments, labels, strict=True)}
+            of = {row.label: row.name for row in names}
+            first, second = (of[int(labels[both][0])] for labels in (merged, mapped))
             raise InputDataError(
-                f"segments of '{path}' overlap in {np.count_nonzero(both)} voxels, as '{by_label[int(merged[where])]}'"
-                f" and '{by_label[int(mapped[where])]}'; a voxel can belong to one tissue only: erase one of the two"
-                " there (3D Slicer: Segment Editor, allow no overlap)"
+                f"segments of '{path}' overlap in {np.count_nonzero(both)} voxels, as '{first}' and '{second}'; erase"
+                " one of the two there (3D Slicer: Segment Editor, allow no overlap)"
             )
         merged += mapped
     return merged, names
