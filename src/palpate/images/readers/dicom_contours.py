@@ -67,10 +67,8 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
     slices = [str(of.ReferencedSOPInstanceUID) for each in tried for of in each.get("ContourImageSequence", ())]
     series = series_beside(path, [*frames] or slices, grid)
     if series is None:
-        raise InputDataError(
-            f"the DICOM series that '{path}' was drawn on is not beside it; copy it into the folder of that file, or"
-            " into one there, or name a grey image on its grid as intensities_before or intensities_after of the case"
-        )
+        advice = "copy it there, or name a grey image on its grid as intensities_before or intensities_after"
+        raise InputDataError(f"the DICOM series that '{path}' was drawn on is not beside it; {advice}")
     # the slices lie across the axis along which the contours run least
     extent = sum((np.ptp(series.grid.index(_points(contour)), axis=0) for contour in tried), np.zeros(3))
     order = sorted(range(3), key=lambda axis: axis != int(np.argmin(extent)))

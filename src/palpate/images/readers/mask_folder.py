@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterator
-from itertools import count, islice
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -33,26 +33,22 @@ def read_mask_folder(folder: Path) -> StoredImage:
     A label's name is that of the file, its number TotalSegmentator's where it is the name of a class, else the next in
     sorted order. Raises `InputDataError` with a sentence for whatever is wrong.
     """
-    files = _mask_files(folder)
-    rows = _rows(files)
-    first, *others = (folder / file for file in files.values())
-    image = _read(first)
+    found = _mask_files(folder)
+    rows, files = _rows(found), [folder / name for name in found.values()]
+    image = _read(files[0])
     digests: dict[str, str] = {}
 
     def masks() -> Iterator[Mask]:
-        for row, file in zip(rows, (first, *others), strict=True):
-            mask = image if file is first else _read(file)
+        for row, file in zip(rows, files, strict=True):
+            mask = image if file is files[0] else _read(file)
             here, there = image.values.shape, mask.values.shape
             apart, voxel = corners_apart(here, image.affine, mask.affine)
             if here != there or not apart <= SAME_PLACE * voxel:  # what is not finite is not
-                how = f"{list(here)} and {list(there)} voxels"
-                if here == there:
-                    how = f"their corners lie up to {apart:.3g} mm apart"
-                pair = " and ".join(f"'{printable(each.name)}'" for each in (first, file))
-                raise InputDataError(
-                    f"the masks {pair} in '{folder}' are not on one grid: {how}; resample them on the grid of one"
-                    " image, with nearest neighbour"
-                )
+                how = f"their corners lie up to {apart:.3g} mm apart"
+                how = how if here == there else f"{list(here)} and {list(there)} voxels"
+                pair = " and ".join(f"'{printable(each.name)}'" for each in (files[0], file))
+                advice = "resample them on the grid of one image, with nearest neighbour"
+                raise InputDataError(f"the masks {pair} in '{folder}' are not on one grid: {how}; {advice}")
             for part, digest in mask.digests.items():
                 digests[printable(f"{file.name}.{part}" if part else file.name)] = digest
             yield Mask(row, _inside(mask, file))
@@ -65,12 +61,9 @@ def _inside(mask: StoredImage, file: Path) -> NDArray[np.bool_]:
     """Its voxels that are not 0, which all have one value, whichever it is."""
     labels = label_values(mask.values, file)
     inside, high = labels > 0, labels.max()
-    others = np.count_nonzero(inside & (labels != high))
-    if others:
-        raise InputDataError(
-            f"'{file}' is no mask of one organ: of its {np.count_nonzero(inside)} voxels that are not 0, {others} have"
-            f" another value than {high}; name a label image by itself, not in a folder of masks"
-        )
+    if others := np.count_nonzero(inside & (labels != high)):
+        flaw = f"of its {np.count_nonzero(inside)} voxels that are not 0, {others} have another value than {high}"
+        raise InputDataError(f"'{file}' is no mask of one organ: {flaw}; name a label image by itself")
     return inside
 
 
@@ -90,10 +83,8 @@ def _mask_files(folder: Path) -> dict[str, str]:
         raise refused_series(folder)
     if not 1 <= len(found) <= MOST_MASKS or len(names) > MOST_FILES:
         among = str(len(names)) if len(names) <= MOST_FILES else f"over {MOST_FILES}"
-        raise InputDataError(
-            f"the folder '{folder}' has {len(found)} masks ({', '.join(ENDINGS)}) among {among} files; 1 to"
-            f" {MOST_MASKS} masks in a folder of their own are read, or name a single label image"
-        )
+        flaw = f"has {len(found)} masks ({', '.join(ENDINGS)}) among {among} files"
+        raise InputDataError(f"the folder '{folder}' {flaw}; 1 to {MOST_MASKS} are read, or name a label image")
     return found
 
 
@@ -101,10 +92,8 @@ def _rows(stems: Collection[str]) -> list[NamedLabel]:
     """Numbers of the task that knows most of the names; others follow after its last class."""
     classes = max(CLASSES.values(), key=lambda known: len(known.keys() & set(stems)))
     others = [stem for stem in stems if stem not in classes]
-    numbers = {
-        **classes,
-        **dict(zip(others, count(1 if len(others) == len(stems) else len(classes) + 1), strict=False)),
-    }
+    first = 1 if len(others) == len(stems) else len(classes) + 1
+    numbers = {**classes, **{stem: number for number, stem in enumerate(others, start=first)}}
     return [NamedLabel(numbers[stem], printable(stem)) for stem in stems]
 
 

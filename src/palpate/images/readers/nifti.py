@@ -107,11 +107,10 @@ def nifti_content(path: Path, check: Callable[[Any, tuple[int, ...], Path], None
 
 def _block(header: Any, path: Path) -> tuple[VoxelBlock, tuple[float, float]]:
     """What the header says of the voxels, and the slope and intercept of their scale."""
-    header_error = import_module("nibabel.spatialimages").HeaderDataError
     try:
         dtype = np.dtype(header.get_data_dtype())
         slope, intercept = header.get_slope_inter()
-    except (header_error, KeyError, ValueError) as error:
+    except Exception as error:  # nibabel raises its own, and what numpy and Python raise
         raise InputDataError(f"the header of '{path}' is damaged: {error}; export the image again") from error
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         flaw = f"are of the type {dtype}; only integers and floats of up to 64 bits are read"
@@ -122,10 +121,10 @@ def _block(header: Any, path: Path) -> tuple[VoxelBlock, tuple[float, float]]:
         raise InputDataError(f"the header of '{path}' gives the sizes {dim}, not positive counts; export it again")
     first = int(header["sizeof_hdr"]) + 4  # four bytes announce extensions; 0 is written by old programs for this
     offset = float(header["vox_offset"]) or float(first)
-    if not math.isfinite(offset) or not first <= offset <= MAX_OFFSET:
+    if not first <= offset <= MAX_OFFSET:
         flaw = f"puts the first voxel at byte {offset:g}, not between {first} and {MAX_OFFSET}"
         raise InputDataError(f"the header of '{path}' {flaw}; export the image again")
-    scale = (1.0 if slope is None else float(slope), 0.0 if intercept is None else float(intercept))
+    scale = (1.0, 0.0) if slope is None else (float(slope), float(intercept))
     return VoxelBlock(tuple(sizes), dtype, skip=int(offset)), scale
 
 
@@ -143,7 +142,8 @@ def nifti_affine(header: Any, path: Path) -> NDArray[np.float64]:
     Where both are set, they must agree; a damaged qform does not matter beside a sform. `path` is for messages.
     Raises `InputDataError`; that the affine is finite and upright is not checked.
     """
-    sform = _sform(header) if int(header["sform_code"]) > 0 else None
+    with np.errstate(all="ignore"):  # what is not finite is refused later, with its numbers
+        sform = np.asarray(header.get_sform()) if int(header["sform_code"]) > 0 else None
     qform, flaw = _qform(header) if int(header["qform_code"]) > 0 else (None, "")
     affine = qform if sform is None else sform
     if affine is None:
@@ -155,7 +155,7 @@ def nifti_affine(header: Any, path: Path) -> NDArray[np.float64]:
         if apart > 0.5 * voxel:
             flaw = f"place its corners up to {apart:.3g} mm apart; delete the wrong one (set its code to 0)"
             raise InputDataError(f"sform and qform in the header of '{path}' {flaw}")
-    with np.errstate(all="ignore"):  # what is not finite is refused later, with its numbers
+    with np.errstate(all="ignore"):
         affine[:3] *= nifti_millimetres(header, path)
     return affine
 
@@ -169,12 +169,6 @@ def nifti_millimetres(header: Any, path: Path) -> float:
     if unit not in MILLIMETRES:
         raise InputDataError(f"the header of '{path}' has the unit of length {unit}, unknown; set it to 2 (millimetre)")
     return MILLIMETRES[unit]
-
-
-def _sform(header: Any) -> NDArray[np.float64]:
-    """The sform (4, 4) in the header's unit of length."""
-    with np.errstate(all="ignore"):
-        return np.array([*(header[f"srow_{axis}"] for axis in "xyz"), [0.0, 0.0, 0.0, 1.0]], dtype=np.float64)
 
 
 def _qform(header: Any) -> tuple[NDArray[np.float64] | None, str]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,26 +21,17 @@ from palpate.images.readers.text_header import numbers_in
 KEY = re.compile(r"Segment([0-9]{1,5})_(ID|Name|Color|LabelValue|Layer)")
 
 
-@dataclass(frozen=True, slots=True)
-class Segment:
-    """One segment: the voxels of `layer` that have the value `label`."""
+def segments_of(keys: Mapping[str, str], path: Path) -> list[tuple[int, NamedLabel]]:
+    """The segments that an NRRD header's key-values describe: layer, then value there, name and colour.
 
-    name: str
-    colour: str | None
-    layer: int
-    label: int
-
-
-def segments_of(keys: Mapping[str, str], path: Path) -> tuple[Segment, ...]:
-    """The segments that an NRRD header's key-values describe, none when it is no segmentation.
+    None when it is no segmentation.
 
     Files of before 2020 have neither values nor layers: there each segment is one layer of zeros and ones.
     Raises `InputDataError` for numbers that cannot be used or two segments of the same value in one layer.
     """
     found: dict[int, dict[str, str]] = {}
     for key, value in keys.items():
-        match = KEY.fullmatch(key)
-        if match:
+        if match := KEY.fullmatch(key):
             found.setdefault(int(match[1]), {})[match[2]] = value
     described = [(number, entry) for number, entry in sorted(found.items()) if {"ID", "Name", "LabelValue"} & {*entry}]
     old = not any("Layer" in entry or "LabelValue" in entry for _, entry in described)
@@ -49,10 +40,10 @@ def segments_of(keys: Mapping[str, str], path: Path) -> tuple[Segment, ...]:
         name = given_name(entry.get("Name", ""), f"segment {number + 1}")
         layer = number if old else _whole(entry.get("Layer", "0"), path, low=0)
         label = _whole(entry.get("LabelValue", "1"), path, low=1)
-        segments.append(Segment(name, unit_colour(entry.get("Color", "").split()), layer, label))
-    if len({(s.layer, s.label) for s in segments}) < len(segments):
-        raise InputDataError(f"'{path}' has two segments of the same label value in one layer; export it again")
-    return tuple(segments)
+        segments.append((layer, NamedLabel(label, name, unit_colour(entry.get("Color", "").split()))))
+    if len({(layer, row.label) for layer, row in segments}) < len(segments):
+        raise InputDataError(f"'{path}' has two segments with the same label value in one layer; export it again")
+    return segments
 
 
 def unit_colour(words: Sequence[str]) -> str | None:
@@ -69,19 +60,18 @@ def _whole(text: str, path: Path, *, low: int) -> int:
 
 
 def flattened(
-    layers: NDArray[Any], segments: tuple[Segment, ...], path: Path
+    layers: NDArray[Any], segments: Sequence[tuple[int, NamedLabel]], path: Path
 ) -> tuple[NDArray[Any], tuple[NamedLabel, ...]]:
     """Labels (n_1, n_2, n_3) of `layers` (n_layers, n_1, n_2, n_3), and the names of the labels.
 
     Values that are unique stay; where two layers use the same one, segments are numbered from 1 as the file has them.
     Raises `InputDataError` when segments overlap or are in no layer, or a voxel of several layers is in no segment.
     """
-    beyond = [s.name for s in segments if s.layer >= len(layers)]
-    if beyond:
+    if beyond := [row.name for layer, row in segments if layer >= len(layers)]:
         flaw = f"{len(layers)} layers, but the segments {beyond[:5]} are in others"
         raise InputDataError(f"'{path}' has {flaw}; export it again")
-    unique = len({s.label for s in segments}) == len(segments)
-    names = tuple(NamedLabel(s.label if unique else k, s.name, s.colour) for k, s in enumerate(segments, start=1))
+    unique = len({row.label for _, row in segments}) == len(segments)
+    names = tuple(row if unique else replace(row, label=k) for k, (_, row) in enumerate(segments, start=1))
     if len(layers) == 1:
         return layers[0], names
     merged = np.zeros(layers.shape[1:], dtype=np.uint16)
@@ -90,22 +80,17 @@ def flattened(
             flaw = f"hold values that are no labels from 0 to {MAX_LABEL}"
             raise InputDataError(f"the layers of '{path}' {flaw}; export it again")
         table = np.zeros(MAX_LABEL + 1, dtype=np.uint16)
-        for s, row in zip(segments, names, strict=True):
-            if s.layer == k:
-                table[s.label] = row.label
+        for (place, row), named in zip(segments, names, strict=True):
+            if place == k:
+                table[row.label] = named.label
         mapped = table[layer]
-        lost = np.count_nonzero((mapped == 0) & (layer > 0))
-        if lost:
-            raise InputDataError(
-                f"'{path}' has {lost} voxels that belong to no segment of their layer; export it again"
-            )
+        if lost := np.count_nonzero((mapped == 0) & (layer > 0)):
+            raise InputDataError(f"'{path}' has {lost} voxels that belong to no segment; export it again")
         both = (merged > 0) & (mapped > 0)
         if both.any():
             of = {row.label: row.name for row in names}
             first, second = (of[int(labels[both][0])] for labels in (merged, mapped))
-            raise InputDataError(
-                f"segments of '{path}' overlap in {np.count_nonzero(both)} voxels, as '{first}' and '{second}'; erase"
-                " one of the two there (3D Slicer: Segment Editor, allow no overlap)"
-            )
+            flaw = f"overlap in {np.count_nonzero(both)} voxels, as '{first}' and '{second}'"
+            raise InputDataError(f"segments of '{path}' {flaw}; erase one of the two there (Segment Editor)")
         merged += mapped
     return merged, names

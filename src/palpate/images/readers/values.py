@@ -44,8 +44,7 @@ def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
     Floats are rounded when they are within 1e-3 of an integer. Raises `InputDataError` for what is no label image.
     """
     if values.dtype.kind == "f":
-        lost = int(values.size - np.count_nonzero(np.isfinite(values)))
-        if lost:
+        if lost := values.size - np.count_nonzero(np.isfinite(values)):
             flaw = f"{lost} of {values.size} voxels that are NaN or infinite"
             raise InputDataError(f"'{path}' has {flaw}; give those voxels a label (0 for background)")
         whole = np.rint(values)
@@ -53,17 +52,13 @@ def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
         worst = np.unravel_index(int(np.argmax(away)), values.shape)
         if away[worst] > INTEGRAL_TOLERANCE:
             flaw = f"{np.count_nonzero(away > INTEGRAL_TOLERANCE)} of {values.size} voxels are not integers"
-            raise InputDataError(
-                f"'{path}' is no label image: {flaw}, as {values[worst]:.6g}; threshold a probability map, or resample"
-                " labels with nearest neighbour"
-            )
+            advice = "threshold a probability map, or resample labels with nearest neighbour"
+            raise InputDataError(f"'{path}' is no label image: {flaw}, as {values[worst]:.6g}; {advice}")
         values = whole
     low, high = values.min(), values.max()
     if low < 0 or high > MAX_LABEL:
-        raise InputDataError(
-            f"the labels of '{path}' run from {low:.9g} to {high:.9g}, not within 0 to {MAX_LABEL}; name a label image"
-            " (segmentation), not a grey image, or renumber the labels"
-        )
+        flaw = f"run from {low:.9g} to {high:.9g}, not within 0 to {MAX_LABEL}"
+        raise InputDataError(f"the labels of '{path}' {flaw}; is it a grey image? Name the segmentation")
     return values.astype(np.uint8 if high <= 255 else np.uint16, copy=False)
 
 
@@ -76,16 +71,12 @@ def check_affine(affine: NDArray[np.float64], path: Path) -> None:
         spacing = np.linalg.norm(affine[:3, :3], axis=0)
         volume, box = abs(np.linalg.det(affine[:3, :3])), np.prod(spacing)
     if not spacing.min() > 0.0 or not np.isfinite(box) or volume < 1e-6 * box or volume < 1e-12:
-        raise InputDataError(
-            f"the affine in the header of '{path}', {affine[:3].tolist()}, flattens the image (voxel edges"
-            f" {spacing.tolist()} mm, volume {volume:.3g} mm^3); {advice}"
-        )
-    cosines = (affine[:3, :3] / spacing).T @ (affine[:3, :3] / spacing) - np.eye(3)
-    if np.abs(cosines).max() > MAX_SHEAR:
-        raise InputDataError(
-            f"the voxel axes of '{path}' are not at right angles (cosine {np.abs(cosines).max():.3g}, a tilted"
-            " gantry?); resample the image on a rectangular grid"
-        )
+        edges = f"voxel edges {spacing.tolist()} mm, volume {volume:.3g} mm^3"
+        raise InputDataError(f"the affine in the header of '{path}' flattens the image ({edges}); {advice}")
+    directions = affine[:3, :3] / spacing
+    if (cosine := np.abs(directions.T @ directions - np.eye(3)).max()) > MAX_SHEAR:
+        flaw = f"are not at right angles (cosine {cosine:.3g}, a tilted gantry?)"
+        raise InputDataError(f"the voxel axes of '{path}' {flaw}; resample it on a rectangular grid")
 
 
 def canonical(image: StoredImage) -> StoredImage:

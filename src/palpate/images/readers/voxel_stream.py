@@ -92,10 +92,8 @@ def read_block(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
     """
     available, skip = file.n_bytes - file.tell(), block.skip
     if not (0 <= skip <= MAX_OFFSET or (skip == -1 and block.packing == "raw")):
-        raise InputDataError(
-            f"the header of '{path}' has {str(skip)[:20]} bytes before the first voxel, not 0 to {MAX_OFFSET}, or -1"
-            " where they are raw; export the image again"
-        )
+        flaw = f"{str(skip)[:20]} bytes before the first voxel, not 0 to {MAX_OFFSET}, or -1 where they are raw"
+        raise InputDataError(f"the header of '{path}' has {flaw}; export the image again")
     if block.packing == "ascii":
         return _written(file, block, path)
     unpacked, ratio = STREAMS[block.packing]
@@ -114,10 +112,8 @@ def read_voxels(stream: io.BufferedIOBase, block: VoxelBlock, path: Path) -> NDA
     while left >= 0 and (rest := stream.read(left + 1)):  # to its end, where the sum is checked
         left -= len(rest)
     if left < 0:
-        raise InputDataError(
-            f"'{path}' goes on for more than {SLACK} bytes after the {block.n_bytes} bytes of voxels that its header"
-            " declares; it is damaged or not what it claims to be: export it again"
-        )
+        flaw = f"goes on for more than {SLACK} bytes after the {block.n_bytes} bytes of voxels of its header"
+        raise InputDataError(f"'{path}' {flaw}; it is damaged, or not what it claims to be: export it again")
     return values.astype(block.dtype.newbyteorder("="), copy=False).reshape(block.shape, order="F")
 
 
@@ -144,10 +140,8 @@ def check_size(shape: tuple[int, ...], path: Path, *, needed: int = 0, available
         flaw = f"promises {sizes} voxels, more than the {MAX_VOXELS} that are read"
         raise InputDataError(f"the header of '{path}' {flaw}; crop the image to the organs, or the header is damaged")
     if needed > available:
-        raise InputDataError(
-            f"the header of '{path}' promises {needed} bytes ({sizes} voxels), which the file cannot hold; it is cut"
-            " short or its header damaged: export or copy it again"
-        )
+        flaw = f"promises {needed} bytes ({sizes} voxels), which the file cannot hold"
+        raise InputDataError(f"the header of '{path}' {flaw}; one of them is damaged: export or copy it again")
 
 
 def read_exactly(stream: io.BufferedIOBase, n_bytes: int, path: Path) -> NDArray[np.uint8]:
