@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,20 +31,6 @@ TOLD: Mapping[Code, str] = {
     "open-contours": "contours were left out, or are cut with the series",
     "sparse-contours": "slices are not as contours were drawn",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class _Structure:
-    """A structure's row, its closed contours by planes at ascending `heights` (n_planes,) in slices.
-
-    flaws: what was left out or is cut, in words.
-    """
-
-    row: NamedLabel
-    heights: NDArray[np.float64]
-    planes: tuple[list[Contour], ...]
-    exclusive: bool
-    flaws: tuple[str, ...]
 
 
 def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
@@ -73,23 +58,23 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
     extent = sum((np.ptp(series.grid.index(_points(contour)), axis=0) for contour in tried), np.zeros(3))
     order = sorted(range(3), key=lambda axis: axis != int(np.argmin(extent)))
     away = set(frames.values()) - {frames.get(series.uid, "")} if series.uid else set[str]()
-    structures = [
-        _structure(row, [] if frame in away else contours, series.grid, order, path)
-        for row, frame, contours in _rows(dataset, drawn)
-    ]
-    if not any(each.planes for each in structures):
+    rows, notes = list[NamedLabel](), {code: list[str]() for code in TOLD}
+
+    def masks() -> Iterator[Mask]:
+        for row, frame, contours in _rows(dataset, drawn):
+            inside, *said = _filled(row, [] if frame in away else contours, series.grid, order, path)
+            for code, words in zip(TOLD, said, strict=True):
+                notes[code] += [f"'{row.name}' ({words})"] if words else []
+            if inside is not None:
+                rows.append(row)
+                yield Mask(row, inside)
+
+    labels, overlaps = merged(masks(), tuple(series.grid.shape[k] for k in order))
+    if not rows:
         raise InputDataError(f"'{path}' has no structure with a contour that encloses something; export it again")
-    shape = tuple(series.grid.shape[k] for k in order)
-    notes: dict[Code, list[str]] = {code: [] for code in TOLD}
-    labels, overlaps = merged(_masks(structures, shape, series.grid, order[0], notes), shape)
     findings = [Finding(code, f"{TOLD[code]}: {_some(parts)}; look at them") for code, parts in notes.items() if parts]
-    return StoredImage(
-        np.moveaxis(labels, 0, order[0]),
-        series.grid.affine,
-        tuple(each.row for each in structures if each.planes),
-        {"": sha256, **series.digests},
-        (*findings, *overlaps),
-    )
+    labels, digests = np.moveaxis(labels, 0, order[0]), {"": sha256, **series.digests}
+    return StoredImage(labels, series.grid.affine, tuple(rows), digests, (*findings, *overlaps))
 
 
 def _points(contour: Dataset) -> NDArray[np.float64]:
@@ -115,53 +100,49 @@ def _rows(dataset: Dataset, drawn: Mapping[int, list[Dataset]]) -> Iterator[tupl
         yield NamedLabel(number if usable else place, name, colour), frame, contours
 
 
-def _structure(
+def _filled(
     row: NamedLabel, contours: list[Dataset], grid: VoxelGrid, order: Sequence[int], path: Path
-) -> _Structure:
+) -> tuple[NDArray[np.bool_] | None, str, str]:
+    """A structure's voxels in the order of axes, what was left out or is cut, and what was filled or joined."""
     several = [(of.get("ContourGeometricType"), grid.index(_points(of))[:, order]) for of in contours]
     closed = [points for kind, points in several if len(points) >= 3 and kind in CLOSED]
-    heights, planes = list[float](), list[list[Contour]]()
+    planes = _planes(closed, f"a contour of '{row.name}' in '{path}'")
+    heights, n_short = np.array([*planes]), sum(len(points) < 3 for _, points in several)
+    counts = {
+        "open": len(several) - n_short - len(closed),
+        "of under 3 points": n_short,
+        "in the file twice": len(closed) - sum(map(len, planes.values())),
+    }
+    flaws = [f"{n} {kind}" for kind, n in counts.items() if n] if several else ["none on this series"]
+    if not closed:
+        return None, " and ".join(flaws), ""
+    shape = np.array(grid.shape)[order]
+    points, middle = np.concatenate(closed), 0.5 * (shape - 1.0)
+    if share := float(np.mean(np.any(np.abs(points - middle) > middle + 0.5 + ONE_PLANE, axis=1))):
+        flaws.append(f"{share:.1%} of its points beyond the series")
+    exclusive = any(kind == EXCLUSIVE for kind, _ in several)
+    inside, noted = body(heights, [*planes.values()], tuple(shape), exclusive=exclusive)
+    flaws += [] if inside.any() else ["no voxel"]
+    words = []
+    for kind, slices in noted.items():
+        index = np.array([[k, *middle[1:]] for k in slices]).reshape(-1, 3)[:, np.argsort(order)]
+        places = _some([f"{mm:.4g}" for mm in grid.world(index)[:, order[0]]])
+        words += [f"{len(slices)} at {'RAS'[order[0]]} {places} mm {kind}"] if slices else []
+    apart = np.sort(np.diff(heights)) * grid.spacing[order[0]]
+    every = " to ".join(dict.fromkeys(f"{mm:.3g}" for mm in (*apart[:1], *apart[-1:])))
+    words += [f"its planes every {every} mm"] if words else []
+    return inside, " and ".join(flaws), "; ".join(words)
+
+
+def _planes(closed: Sequence[Contour], called: str) -> dict[float, list[Contour]]:
+    """By ascending heights in slices the contours that lie there, each once."""
+    planes: dict[float, list[Contour]] = {}
     for points in sorted(closed, key=lambda points: float(points[:, 0].mean())):
         height, spread = float(points[:, 0].mean()), float(np.ptp(points[:, 0]))
         if not spread <= ONE_PLANE:
             flaw = f"runs over {spread:.3g} slices of its series, not one"
-            raise InputDataError(f"a contour of '{row.name}' in '{path}' {flaw}; draw the structures on its slices")
-        if not heights or height - heights[-1] > ONE_PLANE:
-            heights.append(height)
-            planes.append([])
-        planes[-1].append(points[:, 1:])
-    once = tuple(map(distinct, planes))
-    n_short = sum(len(points) < 3 for _, points in several)
-    counts = {
-        "open": len(several) - n_short - len(closed),
-        "of under 3 points": n_short,
-        "in the file twice": len(closed) - sum(map(len, once)),
-    }
-    flaws = [f"{n} {kind}" for kind, n in counts.items() if n] if several else ["none on this series"]
-    middle = 0.5 * (np.array(grid.shape)[order] - 1.0)
-    beyond = [np.any(np.abs(points - middle) > middle + 0.5 + ONE_PLANE, axis=1) for points in closed]
-    if share := float(np.mean(np.concatenate(beyond))) if beyond else 0.0:
-        flaws.append(f"{share:.1%} of its points beyond the series")
-    return _Structure(row, np.array(heights), once, any(kind == EXCLUSIVE for kind, _ in several), tuple(flaws))
-
-
-def _masks(
-    structures: list[_Structure], shape: tuple[int, ...], grid: VoxelGrid, axis: int, notes: dict[Code, list[str]]
-) -> Iterator[Mask]:
-    """The voxels of each structure in turn; `notes` get what was left out or cut, and what was filled or joined."""
-    middle = 0.5 * (np.array(grid.shape) - 1.0)
-    for each in structures:
-        flaws, words = list(each.flaws), list[str]()
-        if each.planes:
-            inside, noted = body(each.heights, each.planes, shape, exclusive=each.exclusive)
-            flaws += [] if inside.any() else ["no voxel"]
-            for kind, slices in noted.items():
-                index = np.where(np.arange(3) == axis, np.reshape(slices, (-1, 1)), middle)
-                heights = _some([f"{mm:.4g}" for mm in grid.world(index)[:, axis]])
-                words += [f"{len(slices)} at {'RAS'[axis]} {heights} mm {kind}"] if slices else []
-            yield Mask(each.row, inside)
-        apart = np.sort(np.diff(each.heights)) * grid.spacing[axis]
-        every = " to ".join(dict.fromkeys(f"{mm:.3g}" for mm in (*apart[:1], *apart[-1:])))
-        words += [f"its planes every {every} mm"] if words else []
-        for code, said in (("open-contours", " and ".join(flaws)), ("sparse-contours", "; ".join(words))):
-            notes[code] += [f"'{each.row.name}' ({said})"] if said else []
+            raise InputDataError(f"{called} {flaw}; draw the structures on its slices")
+        if not planes or height - max(planes) > ONE_PLANE:
+            planes[height] = []
+        planes[max(planes)].append(points[:, 1:])
+    return {height: distinct(contours) for height, contours in planes.items()}

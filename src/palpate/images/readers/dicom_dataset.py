@@ -85,10 +85,9 @@ def series_beside(path: Path, uids: Sequence[str], grid: VoxelGrid | None) -> Se
     )
 
 
-def _files(folder: Path, depth: int = 1) -> Iterator[Path]:
-    with os.scandir(folder) as entries:
-        inside = sorted(entries, key=lambda entry: entry.name)
-    yield from (Path(entry.path) for entry in inside if entry.is_file(follow_symlinks=False))
-    for entry in inside:
-        if depth and entry.is_dir(follow_symlinks=False):
-            yield from _files(Path(entry.path), depth - 1)
+def _files(folder: Path) -> Iterator[Path]:
+    """Regular files in the folder and in those in it; no link is followed."""
+    for place, folders, names in os.walk(folder):
+        files = (Path(place, name) for name in sorted(names))
+        yield from (file for file in files if file.is_file() and not file.is_symlink())
+        folders[:] = sorted(folders) if Path(place) == folder else []

@@ -17,7 +17,7 @@ from palpate.errors import InputDataError
 from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.text_header import StoredArray, header_lines, numbers_in, refused, voxels_of
-from palpate.images.readers.voxel_stream import VoxelBlock, opened, read_block
+from palpate.images.readers.voxel_stream import VoxelBlock, opened
 
 SYNONYMS = {"Rotation": "TransformMatrix", "Orientation": "TransformMatrix", "Position": "Offset", "Origin": "Offset"}
 BIG_ENDIAN = ("BinaryDataByteOrderMSB", "ElementByteOrderMSB")
@@ -56,7 +56,7 @@ def metaimage_content(path: Path) -> StoredArray:
             raise refused(path, "HeaderSize", fields["HeaderSize"], "no voxels begin there: export the image again")
         packing = "zlib" if packed else "raw" if binary else "ascii"
         block = VoxelBlock((channels, *sizes), np.dtype(order + TYPES[kind]), packing, skip)
-        values, digests = voxels_of(file, path, beside, lambda rest: read_block(rest, block, path))
+        values, digests = voxels_of(file, path, beside, block)
     return StoredArray(values, affine, (0, *range(4, values.ndim)), digests)
 
 

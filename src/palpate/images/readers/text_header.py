@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from palpate.errors import InputDataError
 from palpate.images.input_file import InputFile, followed, open_input
 from palpate.images.named_labels import printable
+from palpate.images.readers.voxel_stream import VoxelBlock, read_block
 
 # Not what float() takes besides: nan, inf, 1_0, digits of other scripts.
 NUMBER = re.compile(r"[+-]?([0-9]{1,400}\.?[0-9]{0,400}|\.[0-9]{1,400})([eE][+-]?[0-9]{1,9})?")
@@ -70,14 +71,12 @@ class StoredArray:
         return layers.reshape(-1, *layers.shape[-3:])
 
 
-def voxels_of(
-    file: InputFile, path: Path, name: str | None, read: Callable[[InputFile], NDArray[Any]]
-) -> tuple[NDArray[Any], dict[str, str]]:
-    """The voxels (nx, ny, nz) that `read` finds in the rest of the file, or in `name` beside it, and the digests."""
+def voxels_of(file: InputFile, path: Path, name: str | None, block: VoxelBlock) -> tuple[NDArray[Any], dict[str, str]]:
+    """The voxels in the rest of the file `path`, or in the file `name` beside it, and the digests."""
     if name is None:
-        return read(file), {"": file.sha256()}
+        return read_block(file, block, path), {"": file.sha256()}
     with open_input(_beside(path, name)) as other:
-        return read(other), {"": file.sha256(), "voxels": other.sha256()}
+        return read_block(other, block, path), {"": file.sha256(), "voxels": other.sha256()}
 
 
 def _beside(path: Path, name: str) -> Path:

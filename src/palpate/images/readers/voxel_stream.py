@@ -30,13 +30,14 @@ class VoxelBlock:
     """What a header says of its voxels: `shape` (fastest axis first), `dtype`, how they are packed.
 
     packing: "raw", "gzip", "zlib" (with either head), "bzip2" or "ascii"; skip: bytes before the first voxel,
-    after unpacking; -1: the voxels are the last bytes of the file.
+    after unpacking; -1: the voxels are the last bytes of the file; lines: those before that, not packed.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     packing: str = "raw"
     skip: int = 0
+    lines: int = 0
 
     @property
     def n_bytes(self) -> int:
@@ -90,6 +91,8 @@ def read_block(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
     `path` is for messages, for voxels may lie in a file beside the header.
     Raises `InputDataError` when the file cannot hold them or goes on for long after them.
     """
+    for _ in range(block.lines):
+        file.readline(MAX_OFFSET)
     available, skip = file.n_bytes - file.tell(), block.skip
     if not (0 <= skip <= MAX_OFFSET or (skip == -1 and block.packing == "raw")):
         flaw = f"{str(skip)[:20]} bytes before the first voxel, not 0 to {MAX_OFFSET}, or -1 where they are raw"
@@ -141,7 +144,7 @@ def check_size(shape: tuple[int, ...], path: Path, *, needed: int = 0, available
         raise InputDataError(f"the header of '{path}' {flaw}; crop the image to the organs, or the header is damaged")
     if needed > available:
         flaw = f"promises {needed} bytes ({sizes} voxels), which the file cannot hold"
-        raise InputDataError(f"the header of '{path}' {flaw}; one of them is damaged: export or copy it again")
+        raise InputDataError(f"the header of '{path}' {flaw}; it is cut short or damaged: export or copy it again")
 
 
 def read_exactly(stream: io.BufferedIOBase, n_bytes: int, path: Path) -> NDArray[np.uint8]:
