@@ -256,7 +256,7 @@ def test_vectors_are_there_for_those_who_can_use_them_and_are_no_image(tmp_path:
     content = readers.nifti.nifti_content(tmp_path / "a.nii.gz", lambda *_: None)
     assert np.array_equal(content.values, vectors)
     assert np.array_equal(readers.nifti.nifti_affine(content.header, tmp_path), AFFINE)
-    with pytest.raises(InputDataError, match=r"displacements \(intent 1006\).*three axes"):
+    with pytest.raises(InputDataError, match=r"intent: displacement vector.*three axes"):
         read_label_image(tmp_path / "a.nii.gz")
 
 

@@ -41,7 +41,6 @@ HEADERS = {  # by the first four bytes: nibabel's class, which is imported when 
     for order in "<>"
 }
 MAGIC = (b"n+1\0", b"n+2\0\r\n\032\n")
-VECTORS = {1005: "symmetric matrices", 1006: "displacements", 1007: "vectors", 2003: "colours", 2004: "colours"}
 LONGEST = 1.001  # of a quaternion, whose length is 1 but for rounding
 NO_ROOT = 1e-7  # nifti1_io.c: less than this of 1 - b^2 - c^2 - d^2 is rounding, and the turn is by 180 degrees
 
@@ -130,10 +129,9 @@ def _block(header: Any, path: Path) -> tuple[VoxelBlock, tuple[float, float]]:
 
 def _three_axes(header: Any, sizes: tuple[int, ...], path: Path) -> None:
     if len(sizes) < 3 or any(n > 1 for n in sizes[3:]):
-        intent = int(header["intent_code"])
-        of = f" of {VECTORS[intent]} (intent {intent})" if intent in VECTORS else ""
+        intent = header.get_intent()[0]  # "displacement vector", "none"
         advice = "an image of three axes is needed; extract one volume (a time point, a channel) or stack the slices"
-        raise InputDataError(f"'{path}' has the sizes {list(sizes)}{of}, but {advice}")
+        raise InputDataError(f"'{path}' has the sizes {list(sizes)} (intent: {intent}), but {advice}")
 
 
 def nifti_affine(header: Any, path: Path) -> NDArray[np.float64]:
@@ -239,10 +237,7 @@ def _write(path: Path, values: NDArray[Any], grid: VoxelGrid, *, intent: str = "
     # in one step, so that a crash never leaves half a file there
     temporary = path.with_name(f".{path.name[:50]}.{os.getpid()}.tmp")
     try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+        temporary.write_bytes(content)
         temporary.replace(path)
     except OSError as error:
         with contextlib.suppress(OSError):
