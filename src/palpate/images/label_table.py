@@ -36,6 +36,7 @@ MAX_LINE = 1000  # letters: patterns are tried from each of them
 ENDINGS = (".csv", ".ctbl", ".json", ".label", ".tsv", ".txt")
 COLOUR = re.compile(r"#[0-9a-f]{6}")
 COLUMNS = ("LabelValue", "Name", "Color_R", "Color_G", "Color_B", "Color_A")
+AS_NUMBERS = "write the numbers as the label of a tissue in the case"
 DIGITS = re.compile(r"[0-9]{1,9}")  # not what int() takes besides: blanks, signs, 1_0, digits of other scripts
 COLOURS = r"(?P<red>[0-9]{1,3})\s+(?P<green>[0-9]{1,3})\s+(?P<blue>[0-9]{1,3})"
 ITKSNAP_ROW = re.compile(r"(?P<label>[0-9]{1,9})\s+" + COLOURS + r'(?:\s+[0-9.eE+-]{1,20})*\s+"(?P<name>[^"]*)".*')
@@ -52,46 +53,45 @@ def read_label_table(path: Path | str) -> LabelTable:
     Raises `InputDataError` for a file that cannot be read, or a label or name that is impossible or stands for two.
     """
     path = Path(path)
-    ending = path.suffix.lower()
+    ending, left = path.suffix.lower(), ""
     if ending not in ENDINGS:
         advice = f'the endings known are {", ".join(ENDINGS)}; write it as JSON, {{"1": "prostate"}}'
         raise InputDataError(f"no reader for the label table '{path}': {advice}")
     content, sha256 = whole_input(path, MAX_BYTES)
     try:
         text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputDataError(f"the label table '{path}' is not UTF-8 text ({error}); save it as UTF-8") from error
-    left = ""
-    if ending == ".json":
-        rows, left = _json_rows(text, path)
-    else:
-        rows = (_column_rows if ending in (".csv", ".tsv") else _line_rows)(text, path)
+        if ending == ".json":
+            rows, left = _json_rows(text)
+        else:
+            rows = (_column_rows if ending in (".csv", ".tsv") else _line_rows)(text)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputDataError(f"the label table '{path}' is not UTF-8 text, or damaged ({error}); export it") from error
+    except ValueError as error:
+        raise InputDataError(f"the label table '{path}' {error}; correct it") from error
+    left = f"the label table '{path}' has regions, which were left out: {left}; {AS_NUMBERS}" if left else ""
     table = checked_table(rows, path)
     if not table:
         raise InputDataError(f"the label table '{path}' names no label; {left or 'is it another file?'}")
     return replace(table, sha256=sha256, findings=(Finding("names-left-out", left),) if left else ())
 
 
-def _column_rows(text: str, path: Path) -> list[NamedLabel]:
+def _column_rows(text: str) -> list[NamedLabel]:
     """Rows by the columns of their first line: label and name, and the colour where one is possible."""
     heading = text.partition("\n")[0]
-    try:
-        names, *lines = csv.reader(io.StringIO(text), delimiter=max("\t,;", key=heading.count))
-    except (csv.Error, ValueError) as error:
-        raise InputDataError(f"the label table '{path}' is damaged: {error}; export it again") from error
+    names, *lines = [*csv.reader(io.StringIO(text), delimiter=max("\t,;", key=heading.count))] or [[]]
     columns = [name.strip().lower() for name in names]
     key = "labelvalue" if "labelvalue" in columns else "index"
     if key not in columns or "name" not in columns:
         flaw = "lacks the columns LabelValue and Name (3D Slicer) or index and name (BIDS)"
-        raise InputDataError(f"the label table '{path}' {flaw}; its first line is {heading[:60]!r}")
+        raise ValueError(f"{flaw}; its first line is {heading[:60]!r}")
     found = []
     for line in lines:
-        if not any(cell.strip() for cell in line):
+        row = dict.fromkeys(columns, "") | dict(zip(columns, map(str.strip, line), strict=False))
+        if not any(row.values()):
             continue
-        row = dict.fromkeys(columns, "") | dict(zip(columns, (cell.strip() for cell in line), strict=False))
         name, colour, parts = row["name"], row.get("color", "").lower(), [row.get(f"color_{c}", "") for c in "rgb"]
         if not DIGITS.fullmatch(row[key]):
-            raise InputDataError(f"the label table '{path}' has the label {row[key][:50]!r}, no whole number")
+            raise ValueError(f"has the label {row[key][:50]!r}, which is no whole number")
         if name.startswith("'") and computed(name[1:]):
             name = name[1:]
         if all(map(DIGITS.fullmatch, parts)):
@@ -115,7 +115,7 @@ def slicer_table(rows: Iterable[NamedLabel]) -> str:
     return text.getvalue()
 
 
-def _line_rows(text: str, path: Path) -> list[NamedLabel]:
+def _line_rows(text: str) -> list[NamedLabel]:
     """Rows of ITK-SNAP, whose names stand in quotation marks, or of 3D Slicer and FreeSurfer; `#` begins a comment."""
     lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
     lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
@@ -126,8 +126,7 @@ def _line_rows(text: str, path: Path) -> list[NamedLabel]:
     for number, line in lines:
         found = pattern.fullmatch(line) if len(line) <= MAX_LINE else None
         if found is None:
-            flaw = f"line {number} of the label table '{path}' is {line[:60]!r}, not of {form}"
-            raise InputDataError(f'{flaw}; correct it, or write the table as JSON, {{"1": "prostate"}}')
+            raise ValueError(f"has line {number} {line[:60]!r}, not of {form}")
         colour = hex_colour([int(found[part]) for part in ("red", "green", "blue")], top=255)
         rows.append(NamedLabel(int(found["label"]), found["name"], colour))
     return rows
@@ -146,15 +145,15 @@ def _labels_in(content: Any) -> _Pairs | None:
     return None
 
 
-def _json_rows(text: str, path: Path) -> tuple[list[NamedLabel], str]:
-    """Rows of a JSON table, where a key given twice is seen, and a sentence on the regions that are left out."""
+def _json_rows(text: str) -> tuple[list[NamedLabel], str]:
+    """Rows of a JSON table, where a key given twice is seen, and the regions that are left out, in words."""
     try:
         content = json.loads(text, object_pairs_hook=_Pairs)
         pairs = _labels_in(content) or content
     except (ValueError, RecursionError) as error:
-        raise InputDataError(f"the label table '{path}' is not JSON: {error}; correct it there") from error
+        raise ValueError(f"is not JSON: {error}") from error
     if not isinstance(pairs, _Pairs) or not pairs:
-        raise InputDataError(f'the label table \'{path}\' names no label; write {{"1": "prostate"}}')
+        raise ValueError('names no label; write {"1": "prostate"}')
     numbers, rows = dict[str, list[int]](), []
     for key, given in pairs:  # whichever side holds the number
         several = given if isinstance(given, list) and {type(each) for each in given} == {int} else []
@@ -164,16 +163,12 @@ def _json_rows(text: str, path: Path) -> tuple[list[NamedLabel], str]:
         value = several[0] if several else given
         number, name = (value, key) if type(value) is int else (key, value)
         if not DIGITS.fullmatch(str(number)) or not isinstance(name, str):
-            raise InputDataError(f"the label table '{path}' has the entry {key[:50]!r}, which is not {ROW}")
+            raise ValueError(f"has the entry {key[:50]!r}, which is not {ROW}")
         rows.append(NamedLabel(int(number), name))
         numbers[name] = [int(number)]
     order = next((value for key, value in content if key == "regions_class_order"), None)
     left = _regions(numbers, order if isinstance(order, list) else [])
-    text = (
-        f"the label table '{path}' has regions, which were left out: {', '.join(left.values())}; write the numbers as"
-        " the label of a tissue in the case"
-    )
-    return [row for row in rows if row.name not in left], text if left else ""
+    return [row for row in rows if row.name not in left], ", ".join(left.values())
 
 
 def _regions(numbers: Mapping[str, Sequence[int]], order: Sequence[Any]) -> dict[str, str]:

@@ -42,11 +42,14 @@ def read_nrrd(path: Path, grid: VoxelGrid | None = None) -> StoredImage:
     its reference image, else by `grid`. Raises `InputDataError` with a sentence for whatever is wrong.
     """
     array, fields = nrrd_content(path)
-    segments = segments_of(fields, path)
-    layers = array.layers(path, None if segments else 1)
-    if not segments:
-        return StoredImage(layers[0], array.affine, digests=array.digests)
-    labels, names = flattened(layers, segments, path)
+    try:
+        segments = segments_of(fields)
+        layers = array.layers(path, None if segments else 1)
+        if not segments:
+            return StoredImage(layers[0], array.affine, digests=array.digests)
+        labels, names = flattened(layers, segments)
+    except ValueError as error:
+        raise InputDataError(f"'{path}' {error}; export the segmentation again") from error
     return uncropped(StoredImage(labels, array.affine, names, array.digests), fields, grid, path)
 
 
