@@ -72,7 +72,7 @@ class StoredArray:
 
 
 def voxels_of(file: InputFile, path: Path, name: str | None, block: VoxelBlock) -> tuple[NDArray[Any], dict[str, str]]:
-    """The voxels in the rest of the file `path`, or in the file `name` beside it, and the digests."""
+    """The voxels (n_1, n_2, n_3), or with more axes, behind the header or in the file `name` beside it; the digests."""
     if name is None:
         return read_block(file, block, path), {"": file.sha256()}
     with open_input(_beside(path, name)) as other:
