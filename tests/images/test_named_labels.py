@@ -49,4 +49,4 @@ def test_what_could_command_a_terminal_is_replaced() -> None:
     ],
 )
 def test_colours_are_written_as_in_css(parts: tuple[float, ...], top: float, colour: str | None) -> None:
-    assert hex_colour(*parts, top=top) == colour
+    assert hex_colour(parts, top=top) == colour

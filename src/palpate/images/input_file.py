@@ -7,14 +7,15 @@ import hashlib
 import io
 import os
 import stat
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from palpate.errors import InputDataError
 
 CHUNK = 2**20  # bytes
-NO_WAIT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)  # a pipe that nobody writes to does not hold us
-FLAGS = os.O_RDONLY | NO_WAIT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+# O_NONBLOCK: a pipe that nobody writes to holds nobody
+FLAGS = sum(getattr(os, name, 0) for name in ("O_RDONLY", "O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
 
 
 class _Digested(io.FileIO):
@@ -64,14 +65,20 @@ def open_input(path: Path) -> InputFile:
     """
     descriptor = os.open(path, FLAGS)
     try:
-        mode = os.fstat(descriptor).st_mode
-        if not stat.S_ISREG(mode):
-            kind = "a folder" if stat.S_ISDIR(mode) else "a pipe, a socket or a device"
-            raise OSError(errno.EINVAL, f"it is {kind}, not a file", str(path))
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "it is a folder, a pipe, a socket or a device, not a file", str(path))
         return InputFile(descriptor)
     except BaseException:
         os.close(descriptor)
         raise
+
+
+def followed(path: Path, folder: Path) -> Path | None:
+    """The file that `path` leads to, links followed; None where that lies outside of `folder`."""
+    with suppress(OSError, ValueError, RuntimeError):  # a loop of links, a zero byte, a name too long
+        path = path.resolve()
+        return path if path.is_relative_to(folder.resolve()) else None
+    return path
 
 
 def whole_input(path: Path, limit: int) -> tuple[bytes, str]:

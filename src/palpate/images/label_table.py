@@ -20,16 +20,8 @@ from typing import Any
 from palpate.errors import InputDataError
 from palpate.findings import Finding
 from palpate.images.input_file import whole_input
-from palpate.images.named_labels import (
-    MAX_LABEL,
-    MAX_NAME,
-    LabelTable,
-    NamedLabel,
-    checked_table,
-    computed_by_spreadsheets,
-    hex_colour,
-    printable,
-)
+from palpate.images.named_labels import ROW, LabelTable, NamedLabel, checked_table, hex_colour, printable
+from palpate.images.named_labels import computed_by_spreadsheets as computed
 
 # The classes of TotalSegmentator's tasks `total` (version 2, CT) and `total_mr`: facts, from its table `class_map`
 # (https://github.com/wasserth/TotalSegmentator, totalsegmentator/map_to_binary.py). A class's number is its place in
@@ -44,6 +36,7 @@ MAX_LINE = 1000  # letters: patterns are tried from each of them
 ENDINGS = (".csv", ".ctbl", ".json", ".label", ".tsv", ".txt")
 COLOUR = re.compile(r"#[0-9a-f]{6}")
 COLUMNS = ("LabelValue", "Name", "Color_R", "Color_G", "Color_B", "Color_A")
+AS_NUMBERS = "write the numbers as the label of a tissue in the case"
 DIGITS = re.compile(r"[0-9]{1,9}")  # not what int() takes besides: blanks, signs, 1_0, digits of other scripts
 COLOURS = r"(?P<red>[0-9]{1,3})\s+(?P<green>[0-9]{1,3})\s+(?P<blue>[0-9]{1,3})"
 ITKSNAP_ROW = re.compile(r"(?P<label>[0-9]{1,9})\s+" + COLOURS + r'(?:\s+[0-9.eE+-]{1,20})*\s+"(?P<name>[^"]*)".*')
@@ -60,59 +53,49 @@ def read_label_table(path: Path | str) -> LabelTable:
     Raises `InputDataError` for a file that cannot be read, or a label or name that is impossible or stands for two.
     """
     path = Path(path)
-    if path.suffix.lower() not in ENDINGS:
-        raise InputDataError(
-            f"no reader for the label table '{path}': the endings known are {', '.join(ENDINGS)}; write it as JSON,"
-            ' {"1": "prostate"}'
-        )
+    ending, left = path.suffix.lower(), ""
+    if ending not in ENDINGS:
+        advice = f'the endings known are {", ".join(ENDINGS)}; write it as JSON, {{"1": "prostate"}}'
+        raise InputDataError(f"no reader for the label table '{path}': {advice}")
     content, sha256 = whole_input(path, MAX_BYTES)
     try:
         text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputDataError(f"the label table '{path}' is not UTF-8 text ({error}); save it as UTF-8") from error
-    findings: tuple[Finding, ...] = ()
-    if path.suffix.lower() == ".json":
-        rows, findings = _json_rows(text, path)
-    elif path.suffix.lower() in (".csv", ".tsv"):
-        rows = _column_rows(text, path)
-    else:
-        rows = _line_rows(text, path)
+        if ending == ".json":
+            rows, left = _json_rows(text)
+        else:
+            rows = (_column_rows if ending in (".csv", ".tsv") else _line_rows)(text)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputDataError(f"the label table '{path}' is not UTF-8 text, or damaged ({error}); export it") from error
+    except ValueError as error:
+        raise InputDataError(f"the label table '{path}' {error}; correct it") from error
+    left = f"the label table '{path}' has regions, which were left out: {left}; {AS_NUMBERS}" if left else ""
     table = checked_table(rows, path)
     if not table:
-        left = "".join(f"; {finding.message}" for finding in findings)
-        raise InputDataError(f"the label table '{path}' names no label; is it another file?{left}")
-    return replace(table, sha256=sha256, findings=findings)
+        raise InputDataError(f"the label table '{path}' names no label; {left or 'is it another file?'}")
+    return replace(table, sha256=sha256, findings=(Finding("names-left-out", left),) if left else ())
 
 
-def _column_rows(text: str, path: Path) -> list[NamedLabel]:
+def _column_rows(text: str) -> list[NamedLabel]:
     """Rows by the columns of their first line: label and name, and the colour where one is possible."""
     heading = text.partition("\n")[0]
-    try:
-        names, *lines = csv.reader(io.StringIO(text), delimiter=max("\t,;", key=heading.count))
-    except (csv.Error, ValueError) as error:
-        raise InputDataError(f"the label table '{path}' is damaged: {error}; export it again") from error
+    names, *lines = [*csv.reader(io.StringIO(text), delimiter=max("\t,;", key=heading.count))] or [[]]
     columns = [name.strip().lower() for name in names]
     key = "labelvalue" if "labelvalue" in columns else "index"
     if key not in columns or "name" not in columns:
-        raise InputDataError(
-            f"the label table '{path}' lacks the columns LabelValue and Name (3D Slicer) or index and name (BIDS); its"
-            f" first line is {heading[:60]!r}"
-        )
+        flaw = "lacks the columns LabelValue and Name (3D Slicer) or index and name (BIDS)"
+        raise ValueError(f"{flaw}; its first line is {heading[:60]!r}")
     found = []
     for line in lines:
-        if not any(cell.strip() for cell in line):
+        row = dict.fromkeys(columns, "") | dict(zip(columns, map(str.strip, line), strict=False))
+        if not any(row.values()):
             continue
-        row = dict.fromkeys(columns, "") | dict(zip(columns, (cell.strip() for cell in line), strict=False))
         name, colour, parts = row["name"], row.get("color", "").lower(), [row.get(f"color_{c}", "") for c in "rgb"]
         if not DIGITS.fullmatch(row[key]):
-            raise InputDataError(
-                f"the label table '{path}' has the label {row[key][:50]!r}; it must be a whole number from 0 to"
-                f" {MAX_LABEL}"
-            )
-        if name.startswith("'") and computed_by_spreadsheets(name[1:]):
+            raise ValueError(f"has the label {row[key][:50]!r}, which is no whole number")
+        if name.startswith("'") and computed(name[1:]):
             name = name[1:]
         if all(map(DIGITS.fullmatch, parts)):
-            colour = hex_colour(*map(float, parts), top=255) or ""
+            colour = hex_colour([int(part) for part in parts], top=255) or ""
         found.append(NamedLabel(int(row[key]), name, colour if COLOUR.fullmatch(colour) else None))
     return found
 
@@ -126,28 +109,26 @@ def slicer_table(rows: Iterable[NamedLabel]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     for row in rows:
-        name = f"'{row.name}" if computed_by_spreadsheets(row.name) else row.name
+        name = f"'{row.name}" if computed(row.name) else row.name
         parts = [] if row.colour is None else [*bytes.fromhex(row.colour[1:]), 255]
         writer.writerow([row.label, name, *(parts or [""] * 4)])
     return text.getvalue()
 
 
-def _line_rows(text: str, path: Path) -> list[NamedLabel]:
+def _line_rows(text: str) -> list[NamedLabel]:
     """Rows of ITK-SNAP, whose names stand in quotation marks, or of 3D Slicer and FreeSurfer; `#` begins a comment."""
     lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
     lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
-    quoted = '"' in lines[0][1] if lines else False
-    form = 'ITK-SNAP\'s form `1 255 0 0 1 1 1 "prostate"`' if quoted else "the form `1 prostate 255 0 0 255`"
+    form, pattern = "the form `1 prostate 255 0 0 255`", SLICER_ROW
+    if lines and '"' in lines[0][1]:
+        form, pattern = 'ITK-SNAP\'s form `1 255 0 0 1 1 1 "prostate"`', ITKSNAP_ROW
     rows = []
     for number, line in lines:
-        found = (ITKSNAP_ROW if quoted else SLICER_ROW).fullmatch(line) if len(line) <= MAX_LINE else None
+        found = pattern.fullmatch(line) if len(line) <= MAX_LINE else None
         if found is None:
-            raise InputDataError(
-                f"line {number} of the label table '{path}' is {line[:60]!r}, not of {form}; correct it, or write the"
-                ' table as JSON, {"1": "prostate"}'
-            )
-        red, green, blue = (int(found[colour]) for colour in ("red", "green", "blue"))
-        rows.append(NamedLabel(int(found["label"]), found["name"], hex_colour(red, green, blue, top=255)))
+            raise ValueError(f"has line {number} {line[:60]!r}, not of {form}")
+        colour = hex_colour([int(found[part]) for part in ("red", "green", "blue")], top=255)
+        rows.append(NamedLabel(int(found["label"]), found["name"], colour))
     return rows
 
 
@@ -164,40 +145,30 @@ def _labels_in(content: Any) -> _Pairs | None:
     return None
 
 
-def _json_rows(text: str, path: Path) -> tuple[list[NamedLabel], tuple[Finding, ...]]:
-    """Rows of a JSON table, a key given twice is seen, and a finding on the regions that are left out."""
+def _json_rows(text: str) -> tuple[list[NamedLabel], str]:
+    """Rows of a JSON table, where a key given twice is seen, and the regions that are left out, in words."""
     try:
         content = json.loads(text, object_pairs_hook=_Pairs)
         pairs = _labels_in(content) or content
     except (ValueError, RecursionError) as error:
-        raise InputDataError(f"the label table '{path}' is not JSON: {error}; correct it there") from error
+        raise ValueError(f"is not JSON: {error}") from error
     if not isinstance(pairs, _Pairs) or not pairs:
-        raise InputDataError(f'the label table \'{path}\' names no label; write {{"1": "prostate"}}')
-    rows, numbers = [], dict[str, list[int]]()
+        raise ValueError('names no label; write {"1": "prostate"}')
+    numbers, rows = dict[str, list[int]](), []
     for key, given in pairs:  # whichever side holds the number
-        several = isinstance(given, list) and given and all(type(each) is int for each in given)
-        if several and len(set(given)) > 1:
-            numbers[key] = given
+        several = given if isinstance(given, list) and {type(each) for each in given} == {int} else []
+        if len(set(several)) > 1:
+            numbers[key] = several
             continue
-        value = given[0] if several else given
-        number, name = (value, key) if isinstance(value, int) and not isinstance(value, bool) else (key, value)
-        plain = isinstance(number, int) or (isinstance(number, str) and DIGITS.fullmatch(number))
-        label = int(number) if plain else -1
-        if not 0 <= label <= MAX_LABEL or not isinstance(name, str) or not name.strip() or len(name) > MAX_NAME:
-            kind = {_Pairs: "an object", list: "a list", int: "a number"}.get(type(value), "")
-            raise InputDataError(
-                f"the label table '{path}' has the entry {key[:50]!r}: {kind or repr(str(value)[:50])}; it must be a"
-                f" label from 0 to {MAX_LABEL} and a name of 1 to {MAX_NAME} characters"
-            )
-        rows.append(NamedLabel(label, name))
-        numbers[name] = [label]
+        value = several[0] if several else given
+        number, name = (value, key) if type(value) is int else (key, value)
+        if not DIGITS.fullmatch(str(number)) or not isinstance(name, str):
+            raise ValueError(f"has the entry {key[:50]!r}, which is not {ROW}")
+        rows.append(NamedLabel(int(number), name))
+        numbers[name] = [int(number)]
     order = next((value for key, value in content if key == "regions_class_order"), None)
     left = _regions(numbers, order if isinstance(order, list) else [])
-    text = (
-        f"the label table '{path}' has regions, which were left out: {', '.join(left.values())}; write the numbers as"
-        " the label of a tissue in the case"
-    )
-    return [row for row in rows if row.name not in left], (Finding("names-left-out", text),) if left else ()
+    return [row for row in rows if row.name not in left], ", ".join(left.values())
 
 
 def _regions(numbers: Mapping[str, Sequence[int]], order: Sequence[Any]) -> dict[str, str]:
@@ -206,14 +177,12 @@ def _regions(numbers: Mapping[str, Sequence[int]], order: Sequence[Any]) -> dict
     numbers: by name in the order of the file; order: what nnU-Net writes for them (regions_class_order), where a voxel
     keeps the number of the last region that it is in.
     """
-    if all(len(set(each)) == 1 for each in numbers.values()):
-        return {}
     kept = [name for name, each in numbers.items() if set(each) != {0} and name != "ignore"]
     found = {}
-    for name in kept:
+    for name in kept if any(len(set(each)) > 1 for each in numbers.values()) else ():
         inner = [place for place, other in enumerate(kept) if set(numbers[other]) <= set(numbers[name])]
         predicted = [order[place] for place in inner] if len(order) == len(kept) else numbers[name]
         if len(set(numbers[name])) > 1 or list(predicted) != list(numbers[name]):
-            of_prediction = "" if set(predicted) == set(numbers[name]) else f", in a prediction {predicted}"
-            found[name] = f"'{printable(name)}' ({list(numbers[name])}{of_prediction})"
+            words = f", in a prediction {predicted}" * (set(predicted) != set(numbers[name]))
+            found[name] = f"'{printable(name)}' ({list(numbers[name])}{words})"
     return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from palpate.findings import Finding
 
 MAX_LABEL = 65535
 MAX_NAME = 200
+ROW = f"a label from 0 to {MAX_LABEL} and a name of 1 to {MAX_NAME} characters"
 FORMULA = ("=", "+", "-", "@")  # a spreadsheet would compute a cell that begins so
 
 
@@ -56,10 +57,8 @@ def checked_table(rows: Iterable[NamedLabel], path: Path) -> LabelTable:
     rows = list({(row.label, row.name): row for row in reversed(rows)}.values())  # those that agree are one
     for row in rows:
         if not 0 <= row.label <= MAX_LABEL or not 1 <= len(row.name) <= MAX_NAME:
-            raise InputDataError(
-                f"'{path}' has the entry {str(row.label)[:20]}: {printable(row.name[:50])!r}; it must be a label from"
-                f" 0 to {MAX_LABEL} and a name of 1 to {MAX_NAME} characters"
-            )
+            flaw = f"has the entry {str(row.label)[:20]}: {printable(row.name[:50])!r}; it must be {ROW}"
+            raise InputDataError(f"'{path}' {flaw}")
         if not row.name.isprintable():
             raise InputDataError(f"'{path}' has control characters in the name {row.name!r}; remove them")
     rows.sort(key=lambda row: row.label)
@@ -77,6 +76,11 @@ def printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
+def given_name(text: object, otherwise: str) -> str:
+    """The name that a header gives, which may be anything, as one that a label may have."""
+    return printable(str(text).strip())[:MAX_NAME] or otherwise
+
+
 def computed_by_spreadsheets(name: str) -> bool:
     """Whether a spreadsheet could take `name` in a CSV file for a formula, also where it splits cells at semicolons.
 
@@ -86,9 +90,8 @@ def computed_by_spreadsheets(name: str) -> bool:
     return any(part.strip().lstrip("'\"").startswith(FORMULA) for part in parts)
 
 
-def hex_colour(red: float, green: float, blue: float, *, top: float) -> str | None:
-    """Colour #rrggbb of three components from 0 to `top`; None where one lies outside."""
-    parts = (red, green, blue)
-    if not all(0.0 <= part <= top for part in parts):
+def hex_colour(parts: Sequence[float], *, top: float) -> str | None:
+    """Colour #rrggbb of three components from 0 to `top`; None where they are not three, or one lies outside."""
+    if len(parts) != 3 or not all(0.0 <= part <= top for part in parts):
         return None
     return "#" + "".join(f"{round(255 * part / top):02x}" for part in parts)

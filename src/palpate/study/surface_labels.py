@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -67,83 +68,72 @@ def surface_labels(
     `read_stl`, for an organ without a voxel, and where files say their axes and others do not,
     `ConfigurationError` for names that stand twice or too many, `ResourceError` for a grid that is too large.
     """
-    names = [file.stem for file in files]
-    if len(set(names)) < len(names) or not 0 < len(files) <= MOST_SURFACES:
-        raise ConfigurationError(
-            f"{len(files)} surfaces are named, of {len(set(names))} names; give 1 to {MOST_SURFACES} files of different"
-            " names, which are those of the organs"
-        )
-    surfaces = [read_stl(file) for file in files]
-    said = {surface.space: file for file, surface in zip(files, surfaces, strict=True)}
+    names = {file.stem: number for number, file in enumerate(files, start=1)}
+    if len(names) < len(files) or not 0 < len(files) <= MOST_SURFACES:
+        flaw = f"{len(files)} surfaces are named, of {len(names)} names"
+        raise ConfigurationError(f"{flaw}; give 1 to {MOST_SURFACES} files of different names, those of the organs")
+    surfaces = {file.stem: read_stl(file) for file in files}
+    said = {surface.space: file for file, surface in zip(files, surfaces.values(), strict=True)}
     if axes is None and "" in said and len(said) > 1:
         space = max(said)
-        raise InputDataError(
-            f"the heading of '{said[space]}' says SPACE={space}, that of '{said['']}' does not say its axes; write"
-            f" --axes {space} where one program wrote both, else --axes {'LPS' if space == 'RAS' else 'RAS'}"
-        )
+        advice = f"write --axes {space} where one program wrote both, else --axes {'LPS' if space == 'RAS' else 'RAS'}"
+        flaw = f"the heading of '{said[space]}' says SPACE={space}, that of '{said['']}' does not say its axes"
+        raise InputDataError(f"{flaw}; {advice}")
     signs = {"": LPS_TO_RAS if axes == "LPS" else 1.0, "RAS": 1.0, "LPS": LPS_TO_RAS}
-    surfaces = [replace(each, points=each.points * signs[each.space] * scale) for each in surfaces]
+    surfaces = {name: replace(of, points=of.points * signs[of.space] * scale) for name, of in surfaces.items()}
     grid = like
     if grid is None:  # cubes along RAS that hold all surfaces and the margin
-        low = np.min([surface.points.min(axis=0) for surface in surfaces], axis=0) - margin_mm
-        high = np.max([surface.points.max(axis=0) for surface in surfaces], axis=0) + margin_mm
-        shape = np.ceil((high - low) / spacing_mm)
+        low, high = (np.array([of.ends[side] for of in surfaces.values()]) for side in (0, 1))
+        low, high = low.min(axis=0) - margin_mm, high.max(axis=0) + margin_mm
+        nx, ny, nz = (int(n) for n in np.ceil((high - low) / spacing_mm))
         affine = np.diag([spacing_mm, spacing_mm, spacing_mm, 1.0])
         affine[:3, 3] = low + 0.5 * spacing_mm
-        grid = VoxelGrid((int(shape[0]), int(shape[1]), int(shape[2])), affine)
-    if (size := float(np.prod([float(n) for n in grid.shape]))) > MOST_VOXELS:
-        raise ResourceError(
-            f"the grid would have {size:.3g} voxels, over {MOST_VOXELS}; take larger ones, or less margin"
-            f"{next(filter(None, map(_other_unit, surfaces)), '')}"
-        )
-    counts, findings = dict[str, int](), list[Finding]()
+        grid = VoxelGrid((nx, ny, nz), affine)
+    if (size := math.prod(grid.shape)) > MOST_VOXELS:
+        flaw = f"the grid would have {size:.3g} voxels, over {MOST_VOXELS}; take larger ones, or less margin"
+        raise ResourceError(flaw + next(filter(None, map(_other_unit, surfaces.values())), ""))
+    volumes, findings = dict[str, tuple[float, float]](), list[Finding]()
 
     def masks() -> Iterator[Mask]:
-        for number, (name, surface) in enumerate(zip(names, surfaces, strict=True), start=1):
-            progress(f"surface {number} of {len(surfaces)}: {name}")
+        for name, surface in surfaces.items():
+            progress(f"surface {names[name]} of {len(surfaces)}: {name}")
             inside = _inside(surface, grid)
-            counts[name] = int(np.count_nonzero(inside))
-            findings.extend(_flaws(name, surface, counts[name], grid))
-            yield Mask(NamedLabel(number, name), inside)
+            count = int(np.count_nonzero(inside))
+            volumes[name] = (surface.held_mm3, count * grid.voxel_volume)
+            findings.extend(_flaws(name, surface, count, grid))
+            yield Mask(NamedLabel(names[name], name), inside)
 
     labels, overlaps = merged(masks(), grid.shape)
     left = np.bincount(labels.ravel(), minlength=len(names) + 1)
-    for number, name in enumerate(names, start=1):
+    for name, number in names.items():
         if not left[number]:
-            raise InputDataError(
-                f"smaller organs claim all {counts[name]} voxels of '{name}'; is a surface named twice?"
-            )
-    digests = {name: surface.digest for name, surface in zip(names, surfaces, strict=True)}
-    image = LabelImage(labels, grid, dict(enumerate(names, start=1)), {}, digests, (*findings, *overlaps))
-    held = zip(names, surfaces, strict=True)
-    return SurfaceLabels(image, {name: (of.held_mm3, counts[name] * grid.voxel_volume) for name, of in held})
+            count = round(volumes[name][1] / grid.voxel_volume)
+            raise InputDataError(f"smaller organs claim all {count} voxels of '{name}'; is a surface named twice?")
+    called = {number: name for name, number in names.items()}
+    digests = {name: surface.digest for name, surface in surfaces.items()}
+    return SurfaceLabels(LabelImage(labels, grid, called, {}, digests, (*findings, *overlaps)), volumes)
 
 
 def _flaws(name: str, surface: SurfaceFile, count: int, grid: VoxelGrid) -> list[Finding]:
     """What the `count` of its voxels tells of a surface; raises `InputDataError` where there is none."""
-    ends = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
     held, counted = surface.held_mm3, count * grid.voxel_volume
-    volume = f"{held / 1000.0:.3g} mL"
-    advice = _other_unit(surface) or "; are its unit and its axes right (--scale, --axes)?"
-    if not count or np.ptp(ends, axis=0).max() < 2.0 * grid.spacing.max():
+    volume, last = f"{held / 1000.0:.3g} mL", np.array(grid.shape) - 1.0
+    if not count or np.ptp(surface.ends, axis=0).max() < 2.0 * grid.spacing.max():
+        low, high, first, end = (np.round(each, 3).tolist() for each in (*surface.ends, *grid.world(last * [[0], [1]])))
         raise InputDataError(
-            f"'{name}' has {count} voxels: it holds {volume} from {ends[0].round(3).tolist()} to"
-            f" {ends[1].round(3).tolist()} mm (RAS), on a grid from {grid.affine[:3, 3].round(3).tolist()} to"
-            f" {grid.world(np.array(grid.shape) - 1.0).round(3).tolist()} mm in voxels of {grid.spacing.max():.3g} mm"
-            f"{advice}"
+            f"'{name}' has {count} voxels: it holds {volume} from {low} to {high} mm (RAS), on a grid from {first} to"
+            f" {end} mm in voxels of {grid.spacing.max():.3g} mm"
+            f"{_other_unit(surface) or '; are its unit and its axes right (--scale, --axes)?'}"
         )
     found = []
     index = grid.index(surface.points)
-    beyond = bool(((index < -0.5) | (index > np.array(grid.shape) - 0.5)).any())
-    if beyond and counted < held:
+    if counted < held and (np.abs(index - 0.5 * last) > 0.5 * last + 0.5).any():
         text = f"the grid ends in '{name}': {1.0 - counted / held:.1%} of its {volume} lies beyond; take a larger image"
         found.append(Finding("cut-by-border", text, name))
     elif abs(counted - held) > DOUBTFUL * held:
-        text = (
-            f"the triangles of '{name}' hold {volume}, its voxels {counted / 1000.0:.3g} mL: pieces of it overlap, are"
-            " in the file twice, or are turned inside out; make one surface of them where it was made"
-        )
-        found.append(Finding("overlap", text, name))
+        flaw = "pieces of it overlap, are in the file twice, or are turned inside out"
+        text = f"the triangles of '{name}' hold {volume}, its voxels {counted / 1000.0:.3g} mL: {flaw}"
+        found.append(Finding("overlap", f"{text}; make one surface of them where it was made", name))
     pieces = int(igl.facet_components(surface.triangles)[0])
     if pieces > 1:
         text = f"'{name}' has {pieces} closed pieces, which were taken for one organ; give each organ a file of its own"
@@ -169,14 +159,11 @@ def _inside(surface: SurfaceFile, grid: VoxelGrid) -> NDArray[np.bool_]:
     found = np.zeros(grid.shape, dtype=bool)
     if (high <= low).any():
         return found
-    triangles = np.ascontiguousarray(surface.triangles)
-    points = np.ascontiguousarray(surface.points)
     slab = max(AT_ONCE // int(np.prod((high - low)[1:])), 1)
     for first in range(low[0], high[0], slab):
-        ranges = [range(first, min(first + slab, high[0])), *map(range, low[1:].tolist(), high[1:].tolist())]
-        index = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1)
+        part = np.s_[first : min(first + slab, high[0]), low[1] : high[1], low[2] : high[2]]
+        index = np.moveaxis(np.mgrid[part], 0, -1)
         centres = np.ascontiguousarray(grid.world(index.reshape(-1, 3).astype(np.float64)))
-        winding = np.asarray(igl.fast_winding_number(points, triangles, centres))
-        part = tuple(slice(each.start, each.stop) for each in ranges)
+        winding = np.asarray(igl.fast_winding_number(surface.points, surface.triangles, centres))
         found[part] = (np.abs(winding) > HALF).reshape(index.shape[:3])
     return found

@@ -76,7 +76,7 @@ FLAWS = {
     "no end": (HEAD + ROWS, "are no XML"),
     "no number": (HEAD + '<Label Key="1_0">x</Label>' + TAIL, "have the entry '1_0': 'x'"),
     "an endless name": (HEAD + f'<Label Key="1">{"x" * 201}</Label>' + TAIL, "have the entry '1'"),
-    "a label twice": (HEAD + ROWS + '<Label Key="21">other</Label>' + TAIL, "twice"),
+    "a label twice": (HEAD + ROWS + ROWS.replace("prostate", "rectum") + TAIL, "twice"),
     "no name": (HEAD + '<Label Key="1"> </Label>' + TAIL, "a name of 1 to 200 characters"),
     "depth": (HEAD + "<a>" * 60 + "</a>" * 60 + TAIL, "nested deeper than 50"),
     "size": (HEAD + " " * 2**20 + TAIL, "hold 10.* bytes"),

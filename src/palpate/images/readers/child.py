@@ -14,7 +14,7 @@ import numpy as np
 
 from palpate.errors import PalpateError
 from palpate.images.label_image import VoxelGrid
-from palpate.images.readers.registry import own_format
+from palpate.images.readers.registry import StoredImage, own_format
 from palpate.images.readers.values import reduced
 
 try:
@@ -25,28 +25,16 @@ else:
     LIMITED = True
 
 
-def main(arguments: list[str]) -> None:
-    """Read an image.
-
-    Arguments: bytes of address space, seconds of processor time and by the clock, "labels" or "intensities", the
-    format's name, path, and a grid (JSON).
-    """
-    memory_bytes, cpu_seconds, wall_seconds = int(arguments[0]), int(arguments[1]), float(arguments[2])
-    kind, name, path = arguments[3], arguments[4], Path(arguments[5])
+def main(request: str) -> None:
+    """Read an image. `request`: JSON of the limits, "labels" or "intensities", the format's name, path, and grid."""
+    limits, kind, name, path, grid = json.loads(request)
     with os.fdopen(os.dup(1), "wb") as pipe:  # to the parent
         nowhere = os.open(os.devnull, os.O_WRONLY)  # where goes what a C library prints on standard output
         os.dup2(nowhere, 1)
         os.close(nowhere)
-        _limit(memory_bytes, cpu_seconds, wall_seconds)
+        _limit(*limits)
         try:
-            grid = None
-            if len(arguments) > 6:
-                (nx, ny, nz), affine = json.loads(arguments[6])
-                grid = VoxelGrid((int(nx), int(ny), int(nz)), np.array(affine, dtype=np.float64))
-            image_format = own_format(name)
-            for module in image_format.needless:
-                sys.modules[module] = cast("ModuleType", None)  # whoever imports it is told that it is not installed
-            stored = reduced(image_format.stored(path, grid), path, kind=kind)
+            stored = _read(name, Path(path), kind, grid)
             values = np.asfortranarray(stored.values)
         except PalpateError as error:
             _send(pipe, {"error": type(error).__name__, "message": str(error)})
@@ -70,15 +58,21 @@ def _limit(memory_bytes: int, cpu_seconds: int, wall_seconds: float) -> None:
         return
     signal.signal(signal.SIGALRM, signal.SIG_DFL)  # which ends the process
     signal.setitimer(signal.ITIMER_REAL, wall_seconds)
-    for kind, value in (
-        (resource.RLIMIT_AS, memory_bytes),
-        (resource.RLIMIT_CPU, cpu_seconds),
-        (resource.RLIMIT_FSIZE, 0),
-        (resource.RLIMIT_CORE, 0),
-    ):
+    for name, value in (("AS", memory_bytes), ("CPU", cpu_seconds), ("FSIZE", 0), ("CORE", 0)):
+        kind = getattr(resource, f"RLIMIT_{name}")
         soft, hard = resource.getrlimit(kind)
         lowest = min(limit for limit in (value, soft, hard) if limit != resource.RLIM_INFINITY)
         resource.setrlimit(kind, (lowest, hard))
+
+
+def _read(name: str, path: Path, kind: str, place: Any) -> StoredImage:
+    image_format, grid = own_format(name), None
+    if place:
+        (nx, ny, nz), affine = place
+        grid = VoxelGrid((nx, ny, nz), affine)
+    for module in image_format.needless:
+        sys.modules[module] = cast("ModuleType", None)  # whoever imports it is told that it is not installed
+    return reduced(image_format.stored(path, grid), path, kind=kind)
 
 
 def _send(pipe: BinaryIO, answer: dict[str, Any]) -> None:
@@ -86,4 +80,4 @@ def _send(pipe: BinaryIO, answer: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main(sys.argv[1])

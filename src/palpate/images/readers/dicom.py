@@ -7,10 +7,11 @@ DICOM PS3.6, annex A.
 from __future__ import annotations
 
 import re
+import warnings
 from importlib import import_module
 from pathlib import Path
 
-from palpate.errors import InputDataError, ResourceError
+from palpate.errors import InputDataError, PalpateError, ResourceError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.voxel_stream import opened
@@ -18,9 +19,9 @@ from palpate.images.readers.voxel_stream import opened
 MARK = b"DICM"  # at byte 128
 SOP_CLASS = re.compile(rb"\x02\x00\x02\x00UI(..)([0-9.]{1,64})\0?", re.DOTALL)  # in the file meta information
 READERS = {
-    "1.2.840.10008.5.1.4.1.1.66.4": "dicom_segmentation",  # Segmentation Storage
-    "1.2.840.10008.5.1.4.1.1.66.7": "dicom_segmentation",  # Label Map Segmentation Storage
-    "1.2.840.10008.5.1.4.1.1.481.3": "dicom_contours",  # RT Structure Set Storage
+    b"1.2.840.10008.5.1.4.1.1.66.4": "dicom_segmentation",  # Segmentation Storage
+    b"1.2.840.10008.5.1.4.1.1.66.7": "dicom_segmentation",  # Label Map Segmentation Storage
+    b"1.2.840.10008.5.1.4.1.1.481.3": "dicom_contours",  # RT Structure Set Storage
 }
 
 
@@ -35,17 +36,21 @@ def read_dicom(path: Path, grid: VoxelGrid | None = None) -> StoredImage:
     if head[128:132] != MARK:
         raise InputDataError(f"'{path}' does not begin as a DICOM file does; export the segmentation again")
     found = SOP_CLASS.search(head)
-    reader = READERS.get(found[2].decode("ascii") if found else "")
-    if reader is None:
+    if found is None or found[2] not in READERS:
         raise refused_series(path)
     try:
-        module = import_module(f"palpate.images.readers.{reader}")
+        module = import_module(f"palpate.images.readers.{READERS[found[2]]}")
     except ImportError as error:
-        raise ResourceError(
-            f"'{path}' is a DICOM segmentation, and the libraries that read it are not installed: run"
-            ' pip install "palpate[dicom]"'
-        ) from error
-    image: StoredImage = module.read(path, grid)
+        flaw = "is a DICOM segmentation, and the libraries that read it are not installed"
+        raise ResourceError(f"'{path}' {flaw}: run pip install \"palpate[dicom]\"") from error
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            image: StoredImage = module.read(path, grid)
+    except (PalpateError, MemoryError):
+        raise
+    except Exception as error:  # whose words may quote a patient's data
+        flaw = f"is no DICOM segmentation that can be read ({type(error).__name__})"
+        raise InputDataError(f"'{path}' {flaw}; export it again") from error
     return image
 
 

@@ -10,8 +10,7 @@ import math
 import re
 import subprocess
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -28,9 +27,7 @@ from palpate.processes import environment_of_child, name_of_end
 MAX_ANSWER = 2**24  # bytes of the line that goes before the voxels
 DTYPE, DIGEST = re.compile(r"[<>|][iuf][1248]"), re.compile(r"[0-9a-f]{64}")
 NEVER_BEGAN = 1  # how Python ends that cannot import what it is to run; our code sends every failure
-ERRORS: Mapping[str, type[PalpateError]] = {
-    error.__name__: error for error in (ConfigurationError, InputDataError, ResourceError)
-}
+ERRORS = {error.__name__: error for error in (ConfigurationError, InputDataError, ResourceError)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +50,13 @@ def read_stored(
     if not image_format.read.__module__.startswith("palpate."):
         return image_format.stored(path, grid)  # the program's own code, which another process would not find
     limits = replace(limits, cpu_seconds=image_format.patience * limits.cpu_seconds)
-    numbers = [str(limits.memory_bytes), str(limits.cpu_seconds), str(limits.wall_seconds)]
-    place = [] if grid is None else [json.dumps([grid.shape, grid.affine.tolist()])]
+    place = grid and [grid.shape, grid.affine.tolist()]
+    request = json.dumps([astuple(limits), kind, image_format.name, str(path), place])
     # -P: an image's folder, if it is the working folder, must not be searched for modules.
-    module = ["-P", "-W", "ignore", "-m", "palpate.images.readers.child"]
+    command = [sys.executable, "-P", "-W", "ignore", "-m", "palpate.images.readers.child", request]
     try:
         process = subprocess.Popen(  # noqa: S603 - our own interpreter and module, no shell
-            [sys.executable, *module, *numbers, kind, image_format.name, str(path), *place],
+            command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -81,19 +78,14 @@ def _sudden_end(code: int, path: Path, limits: ReadLimits) -> PalpateError:
     """Why a process ended that sent no image, by its exit code."""
     name = name_of_end(code)
     if code == NEVER_BEGAN:
-        return ResourceError(
-            f"the process that reads '{path}' did not start; is Palpate installed in {sys.prefix} and is memory left?"
-        )
+        advice = f"is Palpate installed in {sys.prefix} and is memory left?"
+        return ResourceError(f"the process that reads '{path}' did not start; {advice}")
     if name in ("SIGXCPU", "SIGALRM"):
-        return ResourceError(
-            f"reading '{path}' took more than {limits.cpu_seconds} s of processor time, or {limits.wall_seconds:g} s in"
-            " all, that one file gets; copy it to a local disk, or it is damaged: export it again"
-        )
+        took = f"more than {limits.cpu_seconds} s of processor time, or {limits.wall_seconds:g} s in all"
+        return ResourceError(f"reading '{path}' took {took}; copy it to a local disk, or export it again")
     if name == "SIGKILL":
-        return ResourceError(
-            f"the system stopped the reading of '{path}', most often because memory is short; crop the image"
-        )
-    return InputDataError(f"the reader of '{path}' crashed ({name}); the file is most likely damaged: export it again")
+        return ResourceError(f"the system stopped the reading of '{path}', as memory is short; crop the image")
+    return InputDataError(f"the reader of '{path}' crashed ({name}); it is most likely damaged: export it again")
 
 
 def _stored(pipe: BinaryIO, path: Path) -> StoredImage | None:
@@ -118,9 +110,7 @@ def _stored(pipe: BinaryIO, path: Path) -> StoredImage | None:
     except (AttributeError, KeyError, TypeError, ValueError):
         valid = None
     if not valid:
-        raise InputDataError(
-            f"the process that read '{path}' gave an answer that cannot be used; export the image again"
-        )
+        raise InputDataError(f"the process that read '{path}' gave an answer of no use; export the image again")
     dtype = np.dtype(answer["dtype"])
     content = pipe.read(math.prod(shape) * dtype.itemsize)
     if len(content) < math.prod(shape) * dtype.itemsize:

@@ -17,24 +17,15 @@ from palpate.errors import InputDataError
 from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.text_header import StoredArray, header_lines, numbers_in, refused, voxels_of
-from palpate.images.readers.voxel_stream import VoxelBlock, opened, read_block
+from palpate.images.readers.voxel_stream import VoxelBlock, opened
 
 SYNONYMS = {"Rotation": "TransformMatrix", "Orientation": "TransformMatrix", "Position": "Offset", "Origin": "Offset"}
 BIG_ENDIAN = ("BinaryDataByteOrderMSB", "ElementByteOrderMSB")
 TYPES = {"CHAR": "i1", "SHORT": "i2", "INT": "i4", "LONG": "i4", "LONG_LONG": "i8", "FLOAT": "f4", "DOUBLE": "f8"}
 TYPES |= {f"U{name}": f"u{code[1]}" for name, code in TYPES.items() if code[0] == "i"}
 LAST = "ElementDataFile"
-USED = {
-    "NDims",
-    "DimSize",
-    "TransformMatrix",
-    "Offset",
-    "ElementSpacing",
-    "ElementSize",
-    "DistanceUnits",
-    "ElementType",
-}
-USED |= {"ElementNumberOfChannels", "BinaryData", "CompressedData", "HeaderSize", LAST, *BIG_ENDIAN}
+USED = {*BIG_ENDIAN, *SYNONYMS.values(), LAST, "NDims", "DimSize", "ElementSpacing", "ElementSize", "DistanceUnits"}
+USED |= {"ElementType", "ElementNumberOfChannels", "BinaryData", "CompressedData", "HeaderSize"}
 
 
 def read_metaimage(path: Path) -> StoredImage:
@@ -55,18 +46,17 @@ def metaimage_content(path: Path) -> StoredArray:
         affine = _affine(fields, len(sizes), path)
         kind = fields.get("ElementType", "").removeprefix("MET_")
         if kind not in TYPES:
-            advice = "only integers and floats of up to 64 bits are read: export one channel"
-            raise refused(path, "ElementType", kind, advice)
+            raise refused(path, "ElementType", kind, "only integers and floats of up to 64 bits are read")
         order = ">" if any(_flag(fields, name, path) for name in BIG_ENDIAN) else "<"
-        packed, binary = _flag(fields, "CompressedData", path), _flag(fields, "BinaryData", path, default="True")
+        packed, binary = _flag(fields, "CompressedData", path), _flag(fields, "BinaryData", path, "True")
         beside = None if fields[LAST].upper() == "LOCAL" else fields[LAST]
-        skip = int(_numbers(fields, "HeaderSize", path, default=[0.0])[0])
+        skip = int(_numbers(fields, "HeaderSize", path, 1, [0.0])[0])
         skip -= file.tell() if beside is None and skip > 0 else 0  # it counts from the start of the file
         if skip < -1 or (skip and packed):
             raise refused(path, "HeaderSize", fields["HeaderSize"], "no voxels begin there: export the image again")
         packing = "zlib" if packed else "raw" if binary else "ascii"
         block = VoxelBlock((channels, *sizes), np.dtype(order + TYPES[kind]), packing, skip)
-        values, digests = voxels_of(file, path, beside, lambda rest: read_block(rest, block, path))
+        values, digests = voxels_of(file, path, beside, block)
     return StoredArray(values, affine, (0, *range(4, values.ndim)), digests)
 
 
@@ -82,9 +72,7 @@ def _fields(lines: list[str], path: Path) -> dict[str, str]:
         if first != second and not (numbers_in(first) and numbers_in(first) == numbers_in(second)):
             raise refused(path, name, fields[name], "it has it twice, with another value then; leave the right one")
     if LAST not in fields:
-        raise InputDataError(
-            f"'{path}' does not begin as a MetaImage file does; export the image as MetaImage or NIfTI"
-        )
+        raise InputDataError(f"'{path}' does not begin as a MetaImage file does; export it as MetaImage or NIfTI")
     return fields
 
 
@@ -96,13 +84,12 @@ def _affine(fields: Mapping[str, str], n: int, path: Path) -> NDArray[np.float64
     name = "ElementSpacing" if "ElementSpacing" in fields else "ElementSize"
     spacing = np.array(_numbers(fields, name, path, n))
     if not (spacing > 0.0).all():
-        advice = "it must be positive: programs take a sign there for a mirror or not; turn the axis in TransformMatrix"
-        raise refused(path, name, fields[name], advice)
+        raise refused(path, name, fields[name], "it must be positive; turn the axis in TransformMatrix")
     if rows[:3, 3:].any() or rows[3:, :3].any():
         raise refused(path, "TransformMatrix", fields["TransformMatrix"], "time leans into space: extract one volume")
     if fields.get("DistanceUnits", "mm") not in ("mm", "?"):
         raise refused(path, "DistanceUnits", fields["DistanceUnits"], "most programs pass over it: state lengths in mm")
-    affine, origin = np.eye(4), _numbers(fields, "Offset", path, n, default=[0.0] * n)
+    affine, origin = np.eye(4), _numbers(fields, "Offset", path, n, [0.0] * n)
     with np.errstate(over="ignore"):  # what is not finite is refused later, with its numbers
         affine[:3, :3] = LPS_TO_RAS[:, None] * rows[:3, :3].T * spacing[:3]
     affine[:3, 3] = LPS_TO_RAS * origin[:3]
@@ -118,23 +105,21 @@ def _counts(fields: Mapping[str, str], name: str, path: Path, default: str = "mi
 
 
 def _numbers(
-    fields: Mapping[str, str], name: str, path: Path, n: int | None = None, *, default: list[float] | None = None
+    fields: Mapping[str, str], name: str, path: Path, n: int, default: list[float] | None = None
 ) -> list[float]:
-    """The numbers of a field, `n` of them where that is known."""
-    if name not in fields and default is not None:
-        return default
-    found = numbers_in(fields.get(name, "").split())
-    if not found or len(found) != (n or len(found)):
-        advice = f"{n or 'plain'} numbers are needed; without them an image has no place: export it again, with them"
+    """The `n` numbers of a field."""
+    found = numbers_in(fields[name].split()) if name in fields else default
+    if found is None or len(found) != n:
+        advice = f"{n} numbers are needed; without them an image has no place: export it again, with them"
         raise refused(path, name, fields.get(name, "missing"), advice)
     return found
 
 
-def _flag(fields: Mapping[str, str], name: str, path: Path, *, default: str = "False") -> bool:
-    value = fields.get(name, default)
-    if value.lower() not in ("true", "false", "1", "0"):
+def _flag(fields: Mapping[str, str], name: str, path: Path, default: str = "False") -> bool:
+    value = fields.get(name, default).lower()
+    if value not in ("true", "false", "1", "0"):
         raise refused(path, name, value, "it is not True or False: correct it")
-    return value.lower() in ("true", "1")
+    return value in ("true", "1")
 
 
 register(ImageFormat("MetaImage", (".mha", ".mhd"), read_metaimage))

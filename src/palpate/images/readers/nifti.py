@@ -10,6 +10,7 @@ import contextlib
 import gzip
 import math
 import os
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -25,19 +26,21 @@ from palpate.images.readers.nifti_extension import extension_names
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.voxel_stream import (
     MAX_OFFSET,
-    MAX_RATIO,
+    STREAMS,
     VoxelBlock,
     check_size,
-    gzip_stream,
     opened,
     read_exactly,
     read_voxels,
 )
 
 MILLIMETRES = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}  # xyzt_units: unknown, metre, millimetre, micrometre
-HEADERS = {348: "Nifti1Header", 540: "Nifti2Header"}  # by nibabel, which is imported when an image comes
-MAGIC = {348: b"n+1\0", 540: b"n+2\0\r\n\032\n"}
-VECTORS = {1005: "symmetric matrices", 1006: "displacements", 1007: "vectors", 2003: "colours", 2004: "colours"}
+HEADERS = {  # by the first four bytes: nibabel's class, which is imported when an image comes, length, byte order
+    struct.pack(f"{order}i", n_bytes): (name, n_bytes, order)
+    for name, n_bytes in (("Nifti1Header", 348), ("Nifti2Header", 540))
+    for order in "<>"
+}
+MAGIC = (b"n+1\0", b"n+2\0\r\n\032\n")
 LONGEST = 1.001  # of a quaternion, whose length is 1 but for rounding
 NO_ROOT = 1e-7  # nifti1_io.c: less than this of 1 - b^2 - c^2 - d^2 is rounding, and the turn is by 180 degrees
 
@@ -75,27 +78,23 @@ def nifti_content(path: Path, check: Callable[[Any, tuple[int, ...], Path], None
     with opened(path) as file:
         zipped = file.peek(2)[:2] == b"\x1f\x8b"
         if zipped != path.name.lower().endswith(".gz"):
-            is_and_should = ("is compressed", ".nii.gz") if zipped else ("is not compressed by gzip", ".nii")
-            raise InputDataError(f"'{path}' {is_and_should[0]}, against its ending; rename it to {is_and_should[1]}")
-        stream = gzip_stream(file) if zipped else file
+            flaw, ending = ("is compressed", ".nii.gz") if zipped else ("is not compressed by gzip", ".nii")
+            raise InputDataError(f"'{path}' {flaw}, against its ending; rename it to {ending}")
+        unpacked, ratio = STREAMS["gzip" if zipped else "raw"]
+        stream = unpacked(file)
         content = read_exactly(stream, 348, path).tobytes()
-        lengths = {sign: int(np.frombuffer(content[:4], dtype=f"{sign}i4")[0]) for sign in ("<", ">")}
-        sign = next((sign for sign, length in lengths.items() if length in HEADERS), None)
-        if sign is None:
+        if content[:4] not in HEADERS:
             raise InputDataError(f"'{path}' does not begin as a NIfTI file does; export the image as NIfTI (.nii.gz)")
-        used = lengths[sign]
+        name, used, order = HEADERS[content[:4]]
         content += read_exactly(stream, used - len(content), path).tobytes()
+        header = getattr(import_module("nibabel"), name)(content, endianness=order, check=False)
         magic = content[344:348] if used == 348 else content[4:12]
-        if magic != MAGIC[used]:
-            raise InputDataError(
-                f"'{path}' has the mark {magic!r}, which is not that of a NIfTI file in one piece; convert Analyze and"
-                " .hdr/.img pairs to .nii.gz"
-            )
-        header = getattr(import_module("nibabel"), HEADERS[used])(content, endianness=sign, check=False)
+        if magic not in MAGIC:
+            advice = "convert Analyze and .hdr/.img pairs to .nii.gz"
+            raise InputDataError(f"'{path}' has the mark {magic!r}, not of a NIfTI file in one piece; {advice}")
         block, (slope, intercept) = _block(header, path)
         check(header, block.shape, path)
-        packed = MAX_RATIO["gzip" if zipped else "raw"]
-        check_size(block.shape, block.skip + block.n_bytes, path, available=file.n_bytes, packed=packed)
+        check_size(block.shape, path, needed=block.skip + block.n_bytes, available=file.n_bytes * ratio)
         between = read_exactly(stream, block.skip - used, path).tobytes()
         values = read_voxels(stream, block, path)
         sha256 = file.sha256()
@@ -107,40 +106,32 @@ def nifti_content(path: Path, check: Callable[[Any, tuple[int, ...], Path], None
 
 def _block(header: Any, path: Path) -> tuple[VoxelBlock, tuple[float, float]]:
     """What the header says of the voxels, and the slope and intercept of their scale."""
-    header_error = import_module("nibabel.spatialimages").HeaderDataError
     try:
         dtype = np.dtype(header.get_data_dtype())
         slope, intercept = header.get_slope_inter()
-    except (header_error, KeyError, ValueError) as error:
+    except Exception as error:  # nibabel raises its own, and what numpy and Python raise
         raise InputDataError(f"the header of '{path}' is damaged: {error}; export the image again") from error
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
-        raise InputDataError(
-            f"the voxels of '{path}' are of the type {dtype}; only integers and floats of up to 64 bits are read:"
-            " export one grey or label channel"
-        )
+        flaw = f"are of the type {dtype}; only integers and floats of up to 64 bits are read"
+        raise InputDataError(f"the voxels of '{path}' {flaw}: export one channel")
     dim = [int(n) for n in header["dim"]]
     sizes = dim[1 : 1 + dim[0]] if 1 <= dim[0] <= 7 else []
     if not sizes or min(sizes) < 1:
         raise InputDataError(f"the header of '{path}' gives the sizes {dim}, not positive counts; export it again")
     first = int(header["sizeof_hdr"]) + 4  # four bytes announce extensions; 0 is written by old programs for this
     offset = float(header["vox_offset"]) or float(first)
-    if not math.isfinite(offset) or not first <= offset <= MAX_OFFSET:
-        raise InputDataError(
-            f"the header of '{path}' puts the first voxel at byte {offset:g}, not between {first} and {MAX_OFFSET};"
-            " export the image again"
-        )
-    scale = (1.0 if slope is None else float(slope), 0.0 if intercept is None else float(intercept))
+    if not first <= offset <= MAX_OFFSET:
+        flaw = f"puts the first voxel at byte {offset:g}, not between {first} and {MAX_OFFSET}"
+        raise InputDataError(f"the header of '{path}' {flaw}; export the image again")
+    scale = (1.0, 0.0) if slope is None else (float(slope), float(intercept))
     return VoxelBlock(tuple(sizes), dtype, skip=int(offset)), scale
 
 
 def _three_axes(header: Any, sizes: tuple[int, ...], path: Path) -> None:
     if len(sizes) < 3 or any(n > 1 for n in sizes[3:]):
-        intent = int(header["intent_code"])
-        of = f" of {VECTORS[intent]} (intent {intent})" if intent in VECTORS else ""
-        raise InputDataError(
-            f"'{path}' has the sizes {list(sizes)}{of}, but an image of three axes is needed; extract one volume (a"
-            " time point, a channel) or stack the slices"
-        )
+        intent = header.get_intent()[0]  # "displacement vector", "none"
+        advice = "an image of three axes is needed; extract one volume (a time point, a channel) or stack the slices"
+        raise InputDataError(f"'{path}' has the sizes {list(sizes)} (intent: {intent}), but {advice}")
 
 
 def nifti_affine(header: Any, path: Path) -> NDArray[np.float64]:
@@ -149,25 +140,20 @@ def nifti_affine(header: Any, path: Path) -> NDArray[np.float64]:
     Where both are set, they must agree; a damaged qform does not matter beside a sform. `path` is for messages.
     Raises `InputDataError`; that the affine is finite and upright is not checked.
     """
-    sform = _sform(header) if int(header["sform_code"]) > 0 else None
+    with np.errstate(all="ignore"):  # what is not finite is refused later, with its numbers
+        sform = np.asarray(header.get_sform()) if int(header["sform_code"]) > 0 else None
     qform, flaw = _qform(header) if int(header["qform_code"]) > 0 else (None, "")
-    if sform is None and flaw:
-        raise InputDataError(f"the qform in the header of '{path}' is damaged: {flaw}; set an sform")
+    affine = qform if sform is None else sform
+    if affine is None:
+        flaw = f"a damaged qform: {flaw}" if flaw else "neither sform nor qform, so left and right are unknown"
+        raise InputDataError(f"the header of '{path}' has {flaw}; set an sform, or export the image with one")
     if sform is not None and qform is not None:
         # which of two places is right, nobody can tell here; half a voxel is more than rounding
         apart, voxel = corners_apart([float(n) for n in header["dim"][1:4]], sform, qform)
         if apart > 0.5 * voxel:
-            raise InputDataError(
-                f"sform and qform in the header of '{path}' place its corners up to {apart:.3g} mm apart; delete the"
-                " wrong one (set its code to 0), or export the image again"
-            )
-    affine = qform if sform is None else sform
-    if affine is None:
-        raise InputDataError(
-            f"the header of '{path}' has neither sform nor qform, so left and right are unknown; export the image with"
-            " its orientation, or set the sform yourself"
-        )
-    with np.errstate(all="ignore"):  # what is not finite is refused later, with its numbers
+            flaw = f"place its corners up to {apart:.3g} mm apart; delete the wrong one (set its code to 0)"
+            raise InputDataError(f"sform and qform in the header of '{path}' {flaw}")
+    with np.errstate(all="ignore"):
         affine[:3] *= nifti_millimetres(header, path)
     return affine
 
@@ -183,33 +169,24 @@ def nifti_millimetres(header: Any, path: Path) -> float:
     return MILLIMETRES[unit]
 
 
-def _sform(header: Any) -> NDArray[np.float64]:
-    """The sform (4, 4) in the header's unit of length."""
-    with np.errstate(all="ignore"):
-        return np.array([*(header[f"srow_{axis}"] for axis in "xyz"), [0.0, 0.0, 0.0, 1.0]], dtype=np.float64)
-
-
 def _qform(header: Any) -> tuple[NDArray[np.float64] | None, str]:
     """The qform (4, 4) in the header's unit of length, or what is wrong with it.
 
     As nifti1_io.c has it: a quaternion longer than 1 by rounding is normalised, and qfac is the sign of pixdim[0].
     """
     b, c, d = (float(header[f"quatern_{part}"]) for part in "bcd")
+    offset = [float(header[f"qoffset_{axis}"]) for axis in "xyz"]
     qfac, *edges = (float(n) for n in header["pixdim"][:4])
-    squares = b * b + c * c + d * d
-    if not squares <= LONGEST**2:
-        return None, f"the quaternion ({b:.6g}, {c:.6g}, {d:.6g}) is longer than 1"
-    if not min(edges) > 0.0 or math.isnan(qfac):
-        return (
-            None,
-            f"pixdim is {qfac:.6g}, {', '.join(f'{edge:.6g}' for edge in edges)}, not 1 or -1 and three lengths",
-        )
-    rest = 1.0 - squares
+    rest = 1.0 - (b * b + c * c + d * d)
+    if not rest >= 1.0 - LONGEST**2:
+        return None, f"its quaternion ({b:.6g}, {c:.6g}, {d:.6g}) is longer than 1"
+    if not np.isfinite([qfac, *edges, *offset]).all() or min(edges) <= 0.0:
+        return None, f"its pixdim is {[qfac, *edges]}, its offset {offset}"
     affine = np.eye(4)
     turn = import_module("nibabel.quaternions").quat2mat([math.sqrt(rest) if rest > NO_ROOT else 0.0, b, c, d])
     affine[:3, :3] = turn * np.array([edges[0], edges[1], edges[2] * (-1.0 if qfac < 0.0 else 1.0)])
-    affine[:3, 3] = [float(header[f"qoffset_{axis}"]) for axis in "xyz"]
-    return (affine, "") if np.isfinite(affine).all() else (None, "it is not finite")
+    affine[:3, 3] = offset
+    return affine, ""
 
 
 def write_label_image(path: Path | str, image: LabelImage) -> None:
@@ -260,17 +237,13 @@ def _write(path: Path, values: NDArray[Any], grid: VoxelGrid, *, intent: str = "
     # in one step, so that a crash never leaves half a file there
     temporary = path.with_name(f".{path.name[:50]}.{os.getpid()}.tmp")
     try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+        temporary.write_bytes(content)
         temporary.replace(path)
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-        raise ResourceError(
-            f"'{path}' cannot be written ({error}); check that the folder exists, is writable and not full"
-        ) from error
+        advice = "check that the folder exists, is writable and not full"
+        raise ResourceError(f"'{path}' cannot be written ({error}); {advice}") from error
 
 
 # half of nibabel's import and more

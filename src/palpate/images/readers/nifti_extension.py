@@ -33,61 +33,50 @@ def extension_names(content: bytes, byte_order: Literal["<", ">"], path: Path) -
             break
         text = content[place + 8 : place + size].rstrip(b"\0 \r\n\t")
         if code == 0 and f"<{ROOT}".encode() in text[:1000]:
-            return tuple(_Table(path).read(text))
+            try:
+                return _rows(text)
+            except (expat.ExpatError, ValueError) as error:
+                flaw = f"are no XML ({error})" if isinstance(error, expat.ExpatError) else str(error)
+                advice = "save the image again, without that extension, and name a label table"
+                raise InputDataError(f"the label names in the header of '{path}' {flaw}; {advice}") from error
         place += size
     return ()
 
 
-class _Table:
-    """Takes the labels out of the XML as it is parsed; nothing else of it is kept, and no entity is expanded."""
+def _rows(content: bytes) -> tuple[NamedLabel, ...]:
+    """The rows of the table; nothing else of the XML is kept, and no entity is expanded.
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._open: list[str] = []
-        self._rows: list[NamedLabel] = []
-        self._attributes: dict[str, str] = {}
-        self._name = ""
+    Raises `ValueError` with what is wrong.
+    """
+    rows: list[NamedLabel] = []
+    elements: list[tuple[str, dict[str, str]]] = []  # those that are open
+    texts: list[str] = []
 
-    def read(self, content: bytes) -> list[NamedLabel]:
-        """The rows of the table."""
-        if len(content) > MOST_BYTES:
-            raise self._refused(f"hold {len(content)} bytes, more than the {MOST_BYTES} that are read")
-        parser = expat.ParserCreate(encoding="utf-8")
-        parser.buffer_text = True
-        parser.StartDoctypeDeclHandler = self._doctype
-        parser.StartElementHandler = self._start
-        parser.CharacterDataHandler = self._text
-        parser.EndElementHandler = self._end
-        try:
-            parser.Parse(content, True)
-        except expat.ExpatError as error:
-            raise self._refused(f"are no XML ({error})") from error
-        return self._rows
+    def doctype(*_: object) -> None:
+        raise ValueError("declare a document type, which label tables do not have")
 
-    def _refused(self, flaw: str) -> InputDataError:
-        return InputDataError(
-            f"the label names in the header of '{self._path}' {flaw}; save the image again, without that extension, and"
-            " name a label table"
-        )
+    def start(name: str, attributes: dict[str, str]) -> None:
+        elements.append((name, attributes))
+        texts.clear()
+        if len(elements) > MOST_DEPTH:
+            raise ValueError(f"are nested deeper than {MOST_DEPTH}")
 
-    def _doctype(self, *_: object) -> None:
-        raise self._refused("declare a document type, which label tables do not have")
+    def end(_: str) -> None:
+        if tuple(name for name, _ in elements) == LABEL:
+            rows.append(_row(elements[-1][1], printable("".join(texts).strip())))
+        elements.pop()
 
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
-        self._open.append(name)
-        if len(self._open) > MOST_DEPTH:
-            raise self._refused(f"are nested deeper than {MOST_DEPTH}")
-        self._attributes, self._name = attributes, ""
+    if len(content) > MOST_BYTES:
+        raise ValueError(f"hold {len(content)} bytes, more than the {MOST_BYTES} that are read")
+    parser = expat.ParserCreate(encoding="utf-8")
+    parser.StartDoctypeDeclHandler, parser.CharacterDataHandler = doctype, texts.append
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.Parse(content, True)
+    return tuple(rows)
 
-    def _text(self, text: str) -> None:
-        if tuple(self._open) == LABEL:
-            self._name += text
 
-    def _end(self, _: str) -> None:
-        if tuple(self._open) == LABEL:
-            key, name = self._attributes.get("Key", ""), printable(self._name.strip())
-            if not (key.isascii() and key.isdigit() and len(key) <= 9) or len(name) > MAX_NAME:
-                raise self._refused(f"have the entry '{printable(key[:20])}': '{name[:50]}'")
-            parts = [self._attributes.get(colour, "") for colour in ("Red", "Green", "Blue")]
-            self._rows.append(NamedLabel(int(key), name, unit_colour(parts)))
-        self._open.pop()
+def _row(attributes: dict[str, str], name: str) -> NamedLabel:
+    key = attributes.get("Key", "")
+    if not (key.isascii() and key.isdigit() and len(key) <= 9) or len(name) > MAX_NAME:
+        raise ValueError(f"have the entry '{printable(key[:20])}': '{name[:50]}'")
+    return NamedLabel(int(key), name, unit_colour([attributes.get(part, "") for part in ("Red", "Green", "Blue")]))

@@ -17,14 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.images.input_file import InputFile
 from palpate.images.label_image import VoxelGrid
 from palpate.images.named_labels import printable
 from palpate.images.readers.reference_grid import uncropped
 from palpate.images.readers.registry import ImageFormat, StoredImage, register
 from palpate.images.readers.segments import flattened, segments_of
 from palpate.images.readers.text_header import StoredArray, header_lines, refused, voxels_of
-from palpate.images.readers.voxel_stream import VoxelBlock, opened, read_block
+from palpate.images.readers.voxel_stream import VoxelBlock, opened
 
 RAS_SIGNS = {"right-anterior-superior": (1, 1, 1), "left-anterior-superior": (-1, 1, 1)}
 RAS_SIGNS |= {"left-posterior-superior": (-1, -1, 1), "ras": (1, 1, 1), "las": (-1, 1, 1), "lps": (-1, -1, 1)}
@@ -33,6 +32,8 @@ PACKINGS |= dict.fromkeys(("ascii", "text", "txt"), "ascii")
 MILLIMETRES = {"mm": 1.0, "millimeter": 1.0, "m": 1000.0, "cm": 10.0, "um": 0.001, "": 1.0}
 SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}
 VECTORS = ("space directions", "space origin")
+NUMBERS = {*VECTORS, "dimension", "sizes", "line skip", "byte skip", "measurement frame", "space dimension"}
+PLAIN = re.compile(r"[ \t0-9a-zA-Z.,()+-]*")
 MAX_LINES = 9999  # between header and voxels
 
 
@@ -43,11 +44,14 @@ def read_nrrd(path: Path, grid: VoxelGrid | None = None) -> StoredImage:
     its reference image, else by `grid`. Raises `InputDataError` with a sentence for whatever is wrong.
     """
     array, fields = nrrd_content(path)
-    segments = segments_of(fields, path)
-    layers = array.layers(path, None if segments else 1)
-    if not segments:
-        return StoredImage(layers[0], array.affine, digests=array.digests)
-    labels, names = flattened(layers, segments, path)
+    try:
+        segments = segments_of(fields)
+        layers = array.layers(path, None if segments else 1)
+        if not segments:
+            return StoredImage(layers[0], array.affine, digests=array.digests)
+        labels, names = flattened(layers, segments)
+    except ValueError as error:
+        raise InputDataError(f"'{path}' {error}; export the segmentation again") from error
     return uncropped(StoredImage(labels, array.affine, names, array.digests), fields, grid, path)
 
 
@@ -58,15 +62,8 @@ def nrrd_content(path: Path) -> tuple[StoredArray, dict[str, Any]]:
     """
     with opened(path) as file:
         fields = _fields(header_lines(file, path, "$"), path)
-        (block, lines), (affine, beside) = _block(fields, path), _place(fields, path)
-
-        def voxels(rest: InputFile) -> NDArray[Any]:
-            """Those behind the lines that are to be skipped."""
-            for _ in range(lines):
-                header_lines(rest, path, "")
-            return read_block(rest, block, path)
-
-        values, digests = voxels_of(file, path, fields.get("data file"), voxels)
+        affine, beside = _place(fields, path)
+        values, digests = voxels_of(file, path, fields.get("data file"), _block(fields, path))
     return StoredArray(values, affine, beside, digests), fields
 
 
@@ -79,6 +76,8 @@ def _fields(lines: list[str], path: Path) -> dict[str, Any]:
         name, colon, value = line.partition(":")
         if not value.startswith("="):  # else it is a key
             name = SYNONYMS.get(name.strip().lower(), name.strip().lower())
+        if name in NUMBERS and not PLAIN.fullmatch(value):  # Python reads 1_5 and digits of all scripts
+            raise refused(path, name, value.strip(), "its numbers must be plain digits: correct it")
         if name in VECTORS:  # without blanks in them; a bare nan, for an axis that is not in space, is none
             vectors = re.findall(r"\([^()]*\)|[^\s()]+", value.lower())
             value = " ".join("none" if each == "nan" else re.sub(r"\s+", "", each) for each in vectors)
@@ -96,12 +95,11 @@ def _fields(lines: list[str], path: Path) -> dict[str, Any]:
     return fields
 
 
-def _block(fields: Mapping[str, Any], path: Path) -> tuple[VoxelBlock, int]:
-    """How the voxels are stored, and how many lines stand before them."""
-    packing = PACKINGS.get(fields["encoding"].lower(), "")
-    if not packing:
-        advice = "raw, gzip, bzip2 and ascii are read; save the image with gzip"
-        raise refused(path, "encoding", fields["encoding"], advice)
+def _block(fields: Mapping[str, Any], path: Path) -> VoxelBlock:
+    """How the voxels are stored."""
+    packing = PACKINGS.get(fields["encoding"].lower())
+    if packing is None:
+        raise refused(path, "encoding", fields["encoding"], "raw, gzip, bzip2 and ascii are read; save it with gzip")
     one = {name: str(fields[name]).lower() for name in ("type", "endian") if name in fields}
     one |= {"endian": "little"} if packing == "ascii" else {}
     try:
@@ -109,12 +107,12 @@ def _block(fields: Mapping[str, Any], path: Path) -> tuple[VoxelBlock, int]:
         dtype = import_module("nrrd").read_data(none, io.BytesIO()).dtype
     except Exception as error:
         field = "endian" if "endian" in str(error) else "type"
-        advice = "integers and floats of up to 64 bits, little or big, are read: export one channel"
+        advice = "integers and floats of up to 64 bits, little or big, are read"
         raise refused(path, field, fields.get(field, "missing"), advice) from error
-    lines = fields.get("line skip", 0)
+    skip, lines = fields.get("byte skip", 0), fields.get("line skip", 0)
     if not 0 <= lines <= MAX_LINES:
         raise refused(path, "line skip", lines, f"it must lie between 0 and {MAX_LINES}; export the image again")
-    return VoxelBlock(tuple(int(n) for n in fields["sizes"]), dtype, packing, fields.get("byte skip", 0)), lines
+    return VoxelBlock(tuple(int(n) for n in fields["sizes"]), dtype, packing, skip, lines)
 
 
 def _place(fields: Mapping[str, Any], path: Path) -> tuple[NDArray[np.float64], tuple[int, ...]]:
@@ -126,8 +124,7 @@ def _place(fields: Mapping[str, Any], path: Path) -> tuple[NDArray[np.float64], 
     timed = space.endswith("-time") or len(space) == 4
     signs, n = RAS_SIGNS.get(space.removesuffix("-time")[: 3 if len(space) == 4 else None]), 3 + timed
     if signs is None or "space directions" not in fields:
-        advice = "it does not say where right, front and head are; export it with its orientation (LPS, RAS)"
-        raise refused(path, "space", space, advice)
+        raise refused(path, "space", space, "it does not say where right, front and head are; export it as LPS or RAS")
     vectors, origin = fields["space directions"], fields.get("space origin", np.zeros(n))
     if vectors.shape != (fields["dimension"], n) or origin.shape != (n,):
         raise refused(path, "space directions", vectors.tolist(), f"vectors of {n} numbers, one a size, are needed")

@@ -56,7 +56,7 @@ def distinct(contours: Sequence[Contour]) -> list[Contour]:
 
 
 def body(
-    heights: NDArray[np.float64], planes: Sequence[Sequence[Contour]], shape: tuple[int, int, int], *, exclusive: bool
+    heights: NDArray[np.float64], planes: Sequence[Sequence[Contour]], shape: tuple[int, ...], *, exclusive: bool
 ) -> tuple[NDArray[np.bool_], dict[str, list[int]]]:
     """Voxels (n_slices, n_rows, n_columns) of planes at ascending `heights` (n,), and slices that are not as drawn.
 
@@ -105,7 +105,7 @@ def _deepest(plane: _Plane, part: float) -> NDArray[np.bool_]:
     return found
 
 
-def _drawn(contours: Sequence[Contour], shape: tuple[int, int], *, exclusive: bool) -> _Plane:
+def _drawn(contours: Sequence[Contour], shape: tuple[int, ...], *, exclusive: bool) -> _Plane:
     """A plane (n_rows, n_columns): a contour in another one is a hole, one in a hole an island."""
     found, crossed = np.zeros(shape, dtype=bool), False
     for contour in sorted(contours, key=lambda of: -float(np.prod(np.ptp(of, axis=0)))):

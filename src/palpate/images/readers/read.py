@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import stat
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +13,8 @@ from palpate.errors import InputDataError, ResourceError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.named_labels import LabelTable, checked_table
 from palpate.images.readers.isolation import ReadLimits, read_stored
-from palpate.images.readers.registry import StoredImage, format_of
-from palpate.images.readers.values import check_affine, reduced, to_canonical
+from palpate.images.readers.registry import FOLDER, StoredImage, format_of
+from palpate.images.readers.values import canonical, check_affine, reduced
 
 LIMITS = ReadLimits()
 
@@ -36,11 +35,11 @@ def read_label_image(
     short.
     """
     path = Path(path)
-    stored, own_grid = _read(path, "labels", limits, grid)
+    stored = _read(path, "labels", limits, grid)
     own = checked_table(stored.names, path)
     table = own or (names if isinstance(names, LabelTable) else LabelTable(names or {}))
     findings = (*stored.findings, *table.findings)
-    return LabelImage(stored.values, own_grid, table.names, table.colours, stored.digests, findings)
+    return LabelImage(stored.values, stored.grid, table.names, table.colours, stored.digests, findings)
 
 
 def read_intensities(
@@ -51,51 +50,41 @@ def read_intensities(
     `sha256`: the digest of the file that is meant. Raises as `read_label_image` does, and `InputDataError` when the
     file has another digest.
     """
-    stored, grid = _read(Path(path), "intensities", limits)
+    stored = _read(Path(path), "intensities", limits)
     if sha256 is not None and stored.digests.get("", sha256) != sha256:
         raise InputDataError(f"'{path}' was changed after this run began; run it again with the file as it is now")
-    return stored.values, grid
+    return stored.values, stored.grid
 
 
-def _read(
-    path: Path, kind: str, limits: ReadLimits | None, given: VoxelGrid | None = None
-) -> tuple[StoredImage, VoxelGrid]:
-    """The image in the order closest to RAS, and its grid; `kind`: what its values are, "labels" or "intensities"."""
+def _read(path: Path, kind: str, limits: ReadLimits | None, grid: VoxelGrid | None = None) -> StoredImage:
+    """The image in the order closest to RAS; `kind`: what its values are, "labels" or "intensities"."""
     image_format = format_of(path)
-    _check_file(path, kind)
+    if FOLDER not in image_format.endings:
+        _check_file(path)
+    elif kind != "labels":
+        raise InputDataError(f"'{path}' is a folder, not a grey image; name the file in it")
     try:
         if limits is None:
-            stored = image_format.stored(path, given)
+            stored = image_format.stored(path, grid)
         else:
-            stored = read_stored(path, kind, image_format, limits, given)
+            stored = read_stored(path, kind, image_format, limits, grid)
         check_affine(stored.affine, path)
-        stored = reduced(stored, path, kind=kind)
-        values, affine = to_canonical(stored.values, stored.affine)
+        return canonical(reduced(stored, path, kind=kind))
     except MemoryError as error:
-        raise ResourceError(
-            f"'{path}' does not fit into the memory of this machine; crop the image to the organs of the case"
-        ) from error
-    grid = VoxelGrid((values.shape[0], values.shape[1], values.shape[2]), affine)
-    return replace(stored, values=values, affine=affine), grid
+        flaw = f"'{path}' does not fit into the memory of this machine"
+        raise ResourceError(f"{flaw}; crop the image to the organs of the case") from error
 
 
-def _check_file(path: Path, kind: str) -> None:
+def _check_file(path: Path) -> None:
     try:
         found = path.stat()
     except FileNotFoundError as error:
-        raise InputDataError(
-            f"there is no file '{path}'; check the path, which in a case file or cohort table begins at that file, and"
-            " whether it was moved since"
-        ) from error
+        advice = "check the path, which in a case file or cohort table begins at that file"
+        raise InputDataError(f"there is no file '{path}'; {advice}, and whether it was moved since") from error
     except (OSError, ValueError) as error:
-        raise InputDataError(
-            f"'{path}' cannot be opened ({error}); check the path and your right to read it"
-        ) from error
-    if stat.S_ISDIR(found.st_mode):
-        if kind == "labels":
-            return
-        raise InputDataError(f"'{path}' is a folder, not a grey image; name the file in it")
+        flaw = f"'{path}' cannot be opened ({error})"
+        raise InputDataError(f"{flaw}; check the path and your right to read it") from error
     if not stat.S_ISREG(found.st_mode):
         raise InputDataError(f"'{path}' is a pipe, a socket or a device; save the image as a file")
-    if found.st_size == 0:
+    if not found.st_size:
         raise InputDataError(f"'{path}' is empty (0 bytes); export or copy the image again")

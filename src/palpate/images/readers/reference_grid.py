@@ -15,7 +15,7 @@ from palpate.findings import Finding
 from palpate.images.label_image import VoxelGrid, corners_apart
 from palpate.images.readers.registry import StoredImage
 from palpate.images.readers.text_header import numbers_in
-from palpate.images.readers.values import check_affine, to_canonical
+from palpate.images.readers.values import canonical, check_affine
 from palpate.images.readers.voxel_stream import check_size
 
 SAME_PLACE = 0.01  # of a voxel, at the corners
@@ -30,11 +30,11 @@ PERHAPS = "segments reach all six sides of the image, as where 3D Slicer cropped
 ADVICE = "save it there without 'crop to minimum extent', or name a grey image on its grid as intensities"
 
 
-def on_grid(image: StoredImage, grid: VoxelGrid) -> StoredImage | None:
+def on_grid(image: StoredImage, grid: VoxelGrid | None) -> StoredImage | None:
     """The image with voxels of 0 added up to `grid`; None where its voxels are not some of that grid's."""
-    first = np.rint(grid.index(image.affine[:3, 3][None])[0])
+    first = np.zeros(3) if grid is None else np.rint(grid.index(image.affine[:3, 3][None])[0])
     last = first + image.values.shape
-    if not ((first >= 0).all() and (last <= grid.shape).all()):  # what is not finite is not
+    if grid is None or not ((first >= 0).all() and (last <= grid.shape).all()):  # what is not finite is not
         return None
     there = grid.affine.copy()
     there[:3, 3] = grid.world(first[None])[0]
@@ -43,7 +43,7 @@ def on_grid(image: StoredImage, grid: VoxelGrid) -> StoredImage | None:
         return None
     whole = np.zeros(grid.shape, dtype=image.values.dtype)
     whole[tuple(slice(int(f), int(end)) for f, end in zip(first, last, strict=True))] = image.values
-    return replace(image, values=whole, affine=grid.affine.copy())
+    return replace(image, values=whole, affine=grid.affine)
 
 
 def uncropped(image: StoredImage, keys: Mapping[str, str], grid: VoxelGrid | None, path: Path) -> StoredImage:
@@ -53,30 +53,22 @@ def uncropped(image: StoredImage, keys: Mapping[str, str], grid: VoxelGrid | Non
     the segments, and has a finding. Raises `InputDataError` for numbers that cannot be used.
     """
     if any(numbers_in(keys.get(EXTENT, "").split())[::2]):
-        raise InputDataError(
-            f"'{path}' was cropped by a 3D Slicer of before 2017, which wrote its place otherwise; open and save it in"
-            " a newer one"
-        )
+        raise InputDataError(f"'{path}' was cropped by a 3D Slicer of before 2017; open and save it in a newer one")
     check_affine(image.affine, path)
     reference = _reference(keys.get(GEOMETRY, ""), path)
-    values, affine = to_canonical(image.values, image.affine)
-    for part, whole in ((image, reference), (replace(image, values=values, affine=affine), grid)):
-        completed = None if whole is None else on_grid(part, whole)
-        if completed is not None:
-            return completed
-    if reference is not None and _covers(image, reference):
+    completed = on_grid(image, reference) or on_grid(canonical(image), grid)
+    if completed or (reference is not None and _covers(image, reference)):
+        return completed or image
+    first = [max(int(n), 0) for n in numbers_in(keys.get(OFFSET, "").split())]
+    first = first if len(first) == 3 else [0, 0, 0]
+    if not any(first) and not _touched(image.values):
         return image
-    offset = numbers_in(keys.get(OFFSET, "").split())
-    first = np.maximum(offset, 0.0) if len(offset) == 3 else np.zeros(3)
-    if not first.any() and not _touched(image.values):
-        return image
-    shape = tuple(int(f) + n for f, n in zip(first, image.values.shape, strict=True))
-    check_size(shape, 0, path, available=0)
-    begin = image.affine.copy()
-    begin[:3, 3] -= begin[:3, :3] @ first
-    begun = on_grid(image, VoxelGrid((shape[0], shape[1], shape[2]), begin))
-    finding = Finding("cropped", f"{CROPPED if first.any() else PERHAPS}; {ADVICE}")
-    return replace(begun or image, findings=(*image.findings, finding))
+    check_size(tuple(n + more for n, more in zip(image.values.shape, first, strict=True)), path)
+    affine = image.affine.copy()
+    affine[:3, 3] -= affine[:3, :3] @ first
+    finding = Finding("cropped", f"{CROPPED if any(first) else PERHAPS}; {ADVICE}")
+    values = np.pad(image.values, [(n, 0) for n in first])
+    return replace(image, values=values, affine=affine, findings=(*image.findings, finding))
 
 
 def _reference(parameters: str, path: Path) -> VoxelGrid | None:
@@ -86,19 +78,19 @@ def _reference(parameters: str, path: Path) -> VoxelGrid | None:
     if len(numbers) != 22 or max(map(abs, numbers)) > FARTHEST:
         return None
     affine, extent = np.vstack([np.reshape(numbers[:12], (3, 4)), np.eye(4)[3]]), np.reshape(numbers[16:], (3, 2))
-    shape = tuple(int(n) for n in extent[:, 1] - extent[:, 0] + 1.0)
-    if min(shape) < 1 or abs(np.linalg.det(affine[:3, :3])) < 1e-12:
+    nx, ny, nz = (int(n) for n in extent[:, 1] - extent[:, 0] + 1.0)
+    if min(nx, ny, nz) < 1 or abs(np.linalg.det(affine[:3, :3])) < 1e-12:
         return None
-    check_size(shape, 0, path, available=0)
+    check_size((nx, ny, nz), path)
     affine[:3, 3] += affine[:3, :3] @ extent[:, 0]
-    return VoxelGrid((shape[0], shape[1], shape[2]), affine)
+    return VoxelGrid((nx, ny, nz), affine)
 
 
 def _covers(image: StoredImage, grid: VoxelGrid) -> bool:
     """Whether no corner of the grid lies outside the image's box."""
     corners = np.array(list(np.ndindex(2, 2, 2))) * grid.shape - 0.5
-    index = VoxelGrid(grid.shape, image.affine).index(grid.world(corners))
-    return bool((index >= -0.5 - SAME_PLACE).all() and (index <= np.array(image.values.shape) - 0.5 + SAME_PLACE).all())
+    half = 0.5 * np.array(image.values.shape)
+    return bool((np.abs(image.grid.index(grid.world(corners)) + 0.5 - half) <= half + SAME_PLACE).all())
 
 
 def _touched(labels: NDArray[np.generic]) -> bool:

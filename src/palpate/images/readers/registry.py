@@ -40,6 +40,12 @@ class StoredImage:
     findings: tuple[Finding, ...] = ()
     scale: tuple[float, float] = (1.0, 0.0)
 
+    @property
+    def grid(self) -> VoxelGrid:
+        """Where its voxels lie."""
+        nx, ny, nz = self.values.shape
+        return VoxelGrid((nx, ny, nz), self.affine)
+
 
 @dataclass(frozen=True, slots=True)
 class ImageFormat:
@@ -72,9 +78,8 @@ def register(image_format: ImageFormat) -> None:
     for ending in image_format.endings:
         owner = _FORMATS.setdefault(ending, image_format)
         if owner is not image_format:
-            raise ConfigurationError(
-                f"the ending '{ending}' belongs to {owner.name} already; register {image_format.name} under another one"
-            )
+            text = f"the ending '{ending}' belongs to {owner.name} already"
+            raise ConfigurationError(f"{text}; register {image_format.name} under another one")
 
 
 @cache
@@ -95,15 +100,11 @@ def format_of(path: Path) -> ImageFormat:
     for ending in sorted(_FORMATS, key=len, reverse=True):
         if path.name.lower().endswith(ending):
             return _FORMATS[ending]
-    marked = marked_format(path)
-    if marked is not None:
+    if (marked := marked_format(path)) is not None:
         return marked
-    known, pair = ", ".join(sorted(set(_FORMATS) - {FOLDER})), path.name.lower().endswith(PAIR)
-    half = ", which is one half of a pair (NIfTI, Analyze; convert both to one .nii.gz)" if pair else ""
-    raise InputDataError(
-        f"no reader for '{path}'{half}: the endings known are {known}; convert the image to one of these, or name a"
-        " folder of masks"
-    )
+    half = ", which is one half of a pair (NIfTI, Analyze)" if path.name.lower().endswith(PAIR) else ""
+    known = ", ".join(sorted(set(_FORMATS) - {FOLDER}))
+    raise InputDataError(f"no reader for '{path}'{half}; convert it to one of {known}, or name a folder of masks")
 
 
 def own_format(name: str) -> ImageFormat:

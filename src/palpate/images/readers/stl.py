@@ -32,6 +32,11 @@ class SurfaceFile:
     space: str
 
     @property
+    def ends(self) -> NDArray[np.float64]:
+        """Its lowest and highest coordinates (2, 3) mm."""
+        return np.array([self.points.min(axis=0), self.points.max(axis=0)])
+
+    @property
     def held_mm3(self) -> float:
         """Volume that the triangles enclose, mm^3."""
         a, b, c = np.moveaxis(self.points[self.triangles] - self.points[0], 1, 0)
@@ -50,9 +55,7 @@ def read_stl(path: Path) -> SurfaceFile:
     if len(content) == whole or (count and len(content) > whole):
         corners = np.asarray(np.frombuffer(content, FACET, count, HEADING + 4)["corners"], dtype=np.float64)
     elif content.lstrip()[:5].lower() != b"solid":
-        raise InputDataError(
-            f"'{path}' is no STL: neither a text that begins with 'solid', nor whole triangles; export it"
-        )
+        raise InputDataError(f"'{path}' is no STL: neither whole triangles, nor a text that begins with 'solid'")
     elif len(content) > MOST_TEXT:
         raise InputDataError(f"'{path}' is a text of over {MOST_TEXT // 2**20} MB; export it as a binary STL")
     else:
@@ -71,15 +74,11 @@ def read_stl(path: Path) -> SurfaceFile:
     turns = np.bincount(edge.reshape(-1), weights=np.sign(edges[:, 1] - edges[:, 0]), minlength=len(shared))
     open_, opposed = np.count_nonzero(shared % 2), np.count_nonzero(turns[shared % 2 == 0])
     if not len(triangles) or open_:
-        raise InputDataError(
-            f"'{path}' is not closed ({len(triangles)} triangles, {open_} edges of an odd number of them), so that it"
-            " has no inside; fill its holes where it was made"
-        )
+        flaw = f"{len(triangles)} triangles, {open_} edges of an odd number of them"
+        raise InputDataError(f"'{path}' is not closed ({flaw}); fill its holes where it was made")
     if opposed:
-        raise InputDataError(
-            f"the triangles beside {opposed} of {len(shared)} edges of '{path}' face opposite ways, so that inside and"
-            " outside cannot be told apart; recalculate its normals where it was made (Blender: Mesh, Normals,"
-            " Recalculate Outside; MeshLab: Re-Orient all faces coherently)"
-        )
+        advice = "recalculate its normals (Blender: Recalculate Outside; MeshLab: Re-Orient all faces coherently)"
+        flaw = f"the triangles beside {opposed} of {len(shared)} edges of '{path}' face opposite ways"
+        raise InputDataError(f"{flaw}; {advice}")
     stated = re.search(rb"SPACE=(RAS|LPS)", content[:HEADING])
     return SurfaceFile(points, triangles, digest, stated[1].decode() if stated else "")

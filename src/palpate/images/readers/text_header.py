@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.images.input_file import InputFile, open_input
+from palpate.images.input_file import InputFile, followed, open_input
 from palpate.images.named_labels import printable
+from palpate.images.readers.voxel_stream import VoxelBlock, read_block
 
 # Not what float() takes besides: nan, inf, 1_0, digits of other scripts.
 NUMBER = re.compile(r"[+-]?([0-9]{1,400}\.?[0-9]{0,400}|\.[0-9]{1,400})([eE][+-]?[0-9]{1,9})?")
@@ -30,9 +32,8 @@ def header_lines(file: InputFile, path: Path, last: str) -> list[str]:
     lines: list[str] = []
     while not (lines and re.match(last, lines[-1], re.IGNORECASE)) and (line := file.readline(MAX_LINE + 1)):
         if len(line) > MAX_LINE or file.tell() > MAX_HEADER:
-            raise InputDataError(
-                f"the header of '{path}' does not end or has a line of over {MAX_LINE} bytes; export it again"
-            )
+            flaw = f"does not end or has a line of over {MAX_LINE} bytes"
+            raise InputDataError(f"the header of '{path}' {flaw}; export it again")
         lines.append(line.decode("utf-8", errors="replace").rstrip())
     return lines
 
@@ -65,20 +66,17 @@ class StoredArray:
         layers = np.moveaxis(self.values, self.beside, range(len(self.beside)))
         lists = [n for n in layers.shape[:-3] if n > 1]
         if len(lists) > 1 or math.prod(lists) > (most or math.inf):
-            sizes = list(self.values.shape)
-            advice = "an image of three axes and one channel is needed; extract one volume (a time point, a channel)"
-            raise refused(path, "sizes", sizes, advice)
+            advice = "three axes and one channel are needed; extract one volume (a time point, a channel)"
+            raise refused(path, "sizes", list(self.values.shape), advice)
         return layers.reshape(-1, *layers.shape[-3:])
 
 
-def voxels_of(
-    file: InputFile, path: Path, name: str | None, read: Callable[[InputFile], NDArray[Any]]
-) -> tuple[NDArray[Any], dict[str, str]]:
-    """The voxels (nx, ny, nz) that `read` finds in the rest of the file, or in `name` beside it, and the digests."""
+def voxels_of(file: InputFile, path: Path, name: str | None, block: VoxelBlock) -> tuple[NDArray[Any], dict[str, str]]:
+    """The voxels (n_1, n_2, n_3), or with more axes, behind the header or in the file `name` beside it; the digests."""
     if name is None:
-        return read(file), {"": file.sha256()}
+        return read_block(file, block, path), {"": file.sha256()}
     with open_input(_beside(path, name)) as other:
-        return read(other), {"": file.sha256(), "voxels": other.sha256()}
+        return read_block(other, block, path), {"": file.sha256(), "voxels": other.sha256()}
 
 
 def _beside(path: Path, name: str) -> Path:
@@ -86,21 +84,13 @@ def _beside(path: Path, name: str) -> Path:
 
     Raises `InputDataError` when it lies elsewhere, is missing, or is a list or pattern of several files.
     """
-    shown = printable(name[:100])
+    target = followed(path.parent / name, path.parent)
     if not name or name.upper().startswith("LIST") or "%" in name:
-        raise InputDataError(
-            f"'{path}' keeps its voxels in several files ('{shown}'); save the image as one file (.nrrd, .mha, .nii.gz)"
-        )
-    try:
-        folder = path.parent.resolve()
-        target = (folder / name).resolve()
-        inside = target.is_relative_to(folder) and not Path(name).is_absolute()
-        found = inside and target.is_file()
-    except (OSError, ValueError, RuntimeError):  # a loop of links, a zero byte, a name too long
-        inside, found = True, False
-    if found:
-        return target
-    flaw = "but there is no such file beside it; copy it there"
-    if not inside:
+        flaw = "which are several files; save the image as one file (.nrrd, .mha, .nii.gz)"
+    elif target is None:
         flaw = "outside its own folder, which is not followed; put both into one folder, or save the image as one file"
-    raise InputDataError(f"'{path}' says that its voxels are in '{shown}', {flaw}")
+    elif not os.path.isfile(target):  # noqa: PTH113 - nor is a name that is too long
+        flaw = "but there is no such file beside it; copy it there"
+    else:
+        return target
+    raise InputDataError(f"'{path}' says that its voxels are in '{printable(name[:100])}', {flaw}")

@@ -25,17 +25,17 @@ def reduced(image: StoredImage, path: Path, *, kind: str) -> StoredImage:
         with np.errstate(over="ignore"):
             return replace(image, values=image.values.astype(np.float32, copy=False))
     slope, intercept = image.scale
-    scaled = f"its header makes them of what is stored by scl_slope {slope:g} and scl_inter {intercept:g}"
-    if image.scale == (1.0, 0.0):
-        return replace(image, values=label_values(image.values, path))
+    scaled = f"scaled: its header makes them of what is stored by scl_slope {slope:g} and scl_inter {intercept:g}"
     try:
-        labels = label_values(image.values, path)
+        image = replace(image, values=label_values(image.values, path))
     except InputDataError as error:
-        raise InputDataError(f"{error}. These are scaled: {scaled}; labels are stored with 1 and 0") from error
-    if 0.0 < slope < 1.0:  # labels that were stored as parts of a range, by programs that scale whatever they save
-        return replace(image, values=labels)
-    text = f"the labels are scaled: {scaled}; set these to 1 and 0 if the stored numbers are the labels"
-    return replace(image, values=labels, findings=(*image.findings, Finding("scaled-labels", text)))
+        if image.scale == (1.0, 0.0):
+            raise
+        raise InputDataError(f"{error}. These are {scaled}; labels are stored with 1 and 0") from error
+    if image.scale == (1.0, 0.0) or 0.0 < slope < 1.0:  # which programs write that scale whatever they save
+        return image
+    text = f"the labels are {scaled}; set these to 1 and 0 if the stored numbers are the labels"
+    return replace(image, findings=(*image.findings, Finding("scaled-labels", text)))
 
 
 def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
@@ -44,28 +44,21 @@ def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
     Floats are rounded when they are within 1e-3 of an integer. Raises `InputDataError` for what is no label image.
     """
     if values.dtype.kind == "f":
-        lost = int(values.size - np.count_nonzero(np.isfinite(values)))
-        if lost:
-            raise InputDataError(
-                f"'{path}' has {lost} of {values.size} voxels that are NaN or infinite; a label is an integer from 0 to"
-                f" {MAX_LABEL}: give those voxels a label (0 for background)"
-            )
+        if lost := values.size - np.count_nonzero(np.isfinite(values)):
+            flaw = f"{lost} of {values.size} voxels that are NaN or infinite"
+            raise InputDataError(f"'{path}' has {flaw}; give those voxels a label (0 for background)")
         whole = np.rint(values)
         away = np.abs(values - whole)
         worst = np.unravel_index(int(np.argmax(away)), values.shape)
         if away[worst] > INTEGRAL_TOLERANCE:
-            raise InputDataError(
-                f"'{path}' is no label image: {np.count_nonzero(away > INTEGRAL_TOLERANCE)} of {values.size} voxels are"
-                f" not integers, as {values[worst]:.6g}; threshold a probability map, or resample labels with nearest"
-                " neighbour"
-            )
+            flaw = f"{np.count_nonzero(away > INTEGRAL_TOLERANCE)} of {values.size} voxels are not integers"
+            advice = "threshold a probability map, or resample labels with nearest neighbour"
+            raise InputDataError(f"'{path}' is no label image: {flaw}, as {values[worst]:.6g}; {advice}")
         values = whole
     low, high = values.min(), values.max()
     if low < 0 or high > MAX_LABEL:
-        raise InputDataError(
-            f"the labels of '{path}' run from {low:.9g} to {high:.9g}, but a label is an integer from 0 to {MAX_LABEL};"
-            " is this a grey image? Name the label image (segmentation) instead, or renumber its labels"
-        )
+        flaw = f"run from {low:.9g} to {high:.9g}, not within 0 to {MAX_LABEL}"
+        raise InputDataError(f"the labels of '{path}' {flaw}; is it a grey image? Name the segmentation")
     return values.astype(np.uint8 if high <= 255 else np.uint16, copy=False)
 
 
@@ -78,36 +71,31 @@ def check_affine(affine: NDArray[np.float64], path: Path) -> None:
         spacing = np.linalg.norm(affine[:3, :3], axis=0)
         volume, box = abs(np.linalg.det(affine[:3, :3])), np.prod(spacing)
     if not spacing.min() > 0.0 or not np.isfinite(box) or volume < 1e-6 * box or volume < 1e-12:
-        raise InputDataError(
-            f"the affine in the header of '{path}', {affine[:3].tolist()}, flattens the image (voxel edges"
-            f" {spacing.tolist()} mm, volume {volume:.3g} mm^3); {advice}"
-        )
-    cosines = (affine[:3, :3] / spacing).T @ (affine[:3, :3] / spacing) - np.eye(3)
-    if np.abs(cosines).max() > MAX_SHEAR:
-        raise InputDataError(
-            f"the voxel axes of '{path}' are not at right angles (cosine {np.abs(cosines).max():.3g}, a tilted"
-            " gantry?); resample the image on a rectangular grid"
-        )
+        edges = f"voxel edges {spacing.tolist()} mm, volume {volume:.3g} mm^3"
+        raise InputDataError(f"the affine in the header of '{path}' flattens the image ({edges}); {advice}")
+    directions = affine[:3, :3] / spacing
+    if (cosine := np.abs(directions.T @ directions - np.eye(3)).max()) > MAX_SHEAR:
+        flaw = f"are not at right angles (cosine {cosine:.3g}, a tilted gantry?)"
+        raise InputDataError(f"the voxel axes of '{path}' {flaw}; resample it on a rectangular grid")
 
 
-def to_canonical(values: NDArray[Any], affine: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    """Re-order and flip the axes of `values` (n_1, n_2, n_3) so that they run to the right, front and head.
+def canonical(image: StoredImage) -> StoredImage:
+    """The image with its axes in another order and direction, so that they run to the right, front and head.
 
-    `affine` (4, 4) index -> RAS mm. Of the six axis orders the one with the largest sum of direction cosines wins; a
-    tie (a grid turned by 45 degrees) is broken by the resulting matrix, so that the way of storing never matters.
+    Of the six axis orders the one with the largest sum of direction cosines wins; a tie (a grid turned by 45 degrees)
+    is broken by the resulting matrix, so that the way of storing never matters.
     """
-    directions = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
-    ranks = {}  # sum of the cosines along the diagonal, then the matrix, rounded so that storage noise breaks no tie
-    for axes in permutations(range(3)):
+    directions = image.affine[:3, :3] / np.linalg.norm(image.affine[:3, :3], axis=0)
+
+    def rank(axes: tuple[int, ...]) -> tuple[float, ...]:
+        """The sum of the cosines, then the matrix, rounded so that storage noise breaks no tie."""
         diagonal = np.diag(directions[:, axes])
         upright = directions[:, axes] * np.where(diagonal < 0.0, -1.0, 1.0)
-        ranks[axes] = (round(float(np.abs(diagonal).sum()), 5), *np.round(upright, 5).ravel().tolist())
-    order = max(ranks, key=lambda axes: ranks[axes])
+        return (round(float(np.abs(diagonal).sum()), 5), *np.round(upright, 5).ravel().tolist())
+
+    order = max(permutations(range(3)), key=rank)
     flips = directions[range(3), order] < 0.0
-    matrix = affine[:3, :3][:, order] * np.where(flips, -1.0, 1.0)
-    last = np.array(values.shape)[list(order)] - 1
-    result = np.eye(4)
-    result[:3, :3] = matrix
-    result[:3, 3] = affine[:3, 3] - matrix @ np.where(flips, last, 0)
-    turned = np.flip(values.transpose(order), axis=tuple(np.flatnonzero(flips)))
-    return np.ascontiguousarray(turned), result
+    values = np.flip(image.values.transpose(order), axis=tuple(np.flatnonzero(flips)))
+    affine = image.affine[:, [*order, 3]] * np.where([*flips, False], -1.0, 1.0) + 0.0  # no minus zero
+    affine[:3, 3] -= affine[:3, :3] @ np.where(flips, np.array(values.shape) - 1, 0)
+    return replace(image, values=np.ascontiguousarray(values), affine=affine)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,18 +21,8 @@ from palpate.images.input_file import InputFile, open_input
 
 MAX_VOXELS = 2**29  # 512 x 512 x 2048, a whole body at 1 mm; a distance map of it would take 4 GiB
 MAX_OFFSET = 2**26  # bytes that may stand between header and voxels
-DEFLATE = 1032.0  # zlib's technical notes
-BZIP2 = 2.0**21  # 52 runs of 900 kB, packed into some 40 bytes
-MAX_RATIO = {"raw": 1.0, "gzip": DEFLATE, "zlib": DEFLATE, "bzip2": BZIP2}  # bytes that a byte can hold
 SLACK = 2**20  # bytes that may follow the voxels
 CHUNK = 2**22  # bytes that are read, and unpacked, at once
-
-
-class Stream(Protocol):
-    """What bytes are read from."""
-
-    def read(self, n: int, /) -> bytes:
-        """The next bytes, `n` at the most; none at the end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,18 +30,47 @@ class VoxelBlock:
     """What a header says of its voxels: `shape` (fastest axis first), `dtype`, how they are packed.
 
     packing: "raw", "gzip", "zlib" (with either head), "bzip2" or "ascii"; skip: bytes before the first voxel,
-    after unpacking; -1: the voxels are the last bytes of the file.
+    after unpacking; -1: the voxels are the last bytes of the file; lines: those before that, not packed.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     packing: str = "raw"
     skip: int = 0
+    lines: int = 0
 
     @property
     def n_bytes(self) -> int:
         """Size of the voxels, bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
+
+
+class _Inflated(io.BufferedIOBase):
+    """A zlib or gzip stream, unpacked no further than is asked for."""
+
+    def __init__(self, file: InputFile) -> None:
+        self._file = file
+        self._inflate = zlib.decompressobj(47)  # 32 + 15: either head
+
+    def read(self, n: int | None = CHUNK, /) -> bytes:
+        """The next bytes, `n` at the most; none after the end mark. Raises `EOFError` where that is missing."""
+        content = b""
+        while not content and not self._inflate.eof:
+            packed = self._inflate.unconsumed_tail or self._file.read(CHUNK)
+            content = self._inflate.decompress(packed, n or CHUNK)
+            if not content and not packed:
+                raise EOFError("the compressed voxels end before their end mark")
+        return content
+
+
+# How each packing is opened, and how many bytes a byte of it can hold: for deflate by zlib's technical notes, for bzip2
+# 52 runs of 900 kB, packed into some 40 bytes.
+STREAMS: dict[str, tuple[Callable[[InputFile], io.BufferedIOBase], float]] = {
+    "raw": (lambda file: file, 1.0),
+    "gzip": (lambda file: gzip.GzipFile(fileobj=file), 1032.0),
+    "zlib": (_Inflated, 1032.0),
+    "bzip2": (bz2.BZ2File, 2.0**21),
+}
 
 
 @contextmanager
@@ -62,9 +81,8 @@ def opened(path: Path) -> Iterator[InputFile]:
             yield file
     except (OSError, EOFError, zlib.error) as error:
         flaw = str(error).rstrip(".")
-        raise InputDataError(
-            f"'{path}' cannot be read: {flaw}; the file is damaged or cut short, export or copy it again"
-        ) from error
+        advice = "the file is damaged or cut short, export or copy it again"
+        raise InputDataError(f"'{path}' cannot be read: {flaw}; {advice}") from error
 
 
 def read_block(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
@@ -73,24 +91,22 @@ def read_block(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
     `path` is for messages, for voxels may lie in a file beside the header.
     Raises `InputDataError` when the file cannot hold them or goes on for long after them.
     """
+    for _ in range(block.lines):
+        file.readline(MAX_OFFSET)
     available, skip = file.n_bytes - file.tell(), block.skip
     if not (0 <= skip <= MAX_OFFSET or (skip == -1 and block.packing == "raw")):
-        raise InputDataError(
-            f"the header of '{path}' has {count(skip)} bytes before the first voxel, not 0 to {MAX_OFFSET}, or -1 where"
-            " they are raw; export the image again"
-        )
+        flaw = f"{str(skip)[:20]} bytes before the first voxel, not 0 to {MAX_OFFSET}, or -1 where they are raw"
+        raise InputDataError(f"the header of '{path}' has {flaw}; export the image again")
     if block.packing == "ascii":
         return _written(file, block, path)
-    needed, packed = max(skip, 0) + block.n_bytes, MAX_RATIO[block.packing]
-    check_size(block.shape, needed, path, available=available, packed=packed)
-    skip = available - block.n_bytes if skip < 0 else skip
-    stream = OPENED[block.packing](file)
-    while skip:
-        skip -= len(read_exactly(stream, min(skip, SLACK), path))
+    unpacked, ratio = STREAMS[block.packing]
+    check_size(block.shape, path, needed=max(skip, 0) + block.n_bytes, available=available * ratio)
+    stream = unpacked(file)
+    read_exactly(stream, available - block.n_bytes if skip < 0 else skip, path)
     return read_voxels(stream, block, path)
 
 
-def read_voxels(stream: Stream, block: VoxelBlock, path: Path) -> NDArray[Any]:
+def read_voxels(stream: io.BufferedIOBase, block: VoxelBlock, path: Path) -> NDArray[Any]:
     """The voxels (nx, ny, nz) of `block`, whose size was checked, from where `stream` stands.
 
     Raises `InputDataError` when it ends before they do, or goes on for long after them.
@@ -99,17 +115,15 @@ def read_voxels(stream: Stream, block: VoxelBlock, path: Path) -> NDArray[Any]:
     while left >= 0 and (rest := stream.read(left + 1)):  # to its end, where the sum is checked
         left -= len(rest)
     if left < 0:
-        raise InputDataError(
-            f"'{path}' goes on for more than {SLACK} bytes after the {block.n_bytes} bytes of voxels that its header"
-            " declares; it is damaged or not what it claims to be: export it again"
-        )
+        flaw = f"goes on for more than {SLACK} bytes after the {block.n_bytes} bytes of voxels of its header"
+        raise InputDataError(f"'{path}' {flaw}; it is damaged, or not what it claims to be: export it again")
     return values.astype(block.dtype.newbyteorder("="), copy=False).reshape(block.shape, order="F")
 
 
 def _written(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
     """Voxels that are written out as decimal numbers; each is exact in its type."""
     n = math.prod(block.shape)
-    check_size(block.shape, 2 * n - 1, path, available=file.n_bytes - file.tell() - block.skip)
+    check_size(block.shape, path, needed=2 * n - 1, available=file.n_bytes - file.tell() - block.skip)
     try:
         values = np.array(file.read()[block.skip :].split()).astype(np.float64)
     except ValueError:
@@ -117,80 +131,31 @@ def _written(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
     with np.errstate(all="ignore"):
         exact = values.astype(block.dtype.newbyteorder("="))
     if len(values) != n or not (block.dtype.kind == "f" or (exact == values).all()):
-        raise InputDataError(
-            f"the voxels of '{path}' are written as text, but {n} numbers of the type {block.dtype.name} are not there;"
-            " export the image again"
-        )
+        flaw = f"are written as text, but {n} numbers of the type {block.dtype.name} are not there"
+        raise InputDataError(f"the voxels of '{path}' {flaw}; export the image again")
     return exact.reshape(block.shape, order="F")
 
 
-def count(number: int) -> str:
-    """A count that a damaged header may have made absurd."""
-    return str(number) if abs(number) < 10**12 else f"over {10**12}"
-
-
-def check_size(shape: tuple[int, ...], needed: int, path: Path, *, available: int, packed: float = 1.0) -> None:
-    """Refuse what the file cannot hold: `needed` bytes in `available` ones, of which each holds `packed` at most."""
-    sizes = " x ".join(map(count, shape))
+def check_size(shape: tuple[int, ...], path: Path, *, needed: int = 0, available: float = 0.0) -> None:
+    """Refuse more voxels than are read, and what the file cannot hold: `needed` bytes in `available` unpacked ones."""
+    sizes = " x ".join(map(str, shape))[:100]
     if math.prod(shape) > MAX_VOXELS:
-        raise InputDataError(
-            f"the header of '{path}' promises {count(math.prod(shape))} voxels ({sizes}), more than the {MAX_VOXELS}"
-            " that are read; crop the image to the organs, or the header is damaged"
-        )
-    if needed > available * packed:
-        raise InputDataError(
-            f"the header of '{path}' promises {needed} bytes ({sizes} voxels), but the {available} bytes there"
-            " cannot hold them; the file is cut short or its header damaged: export or copy it again"
-        )
+        flaw = f"promises {sizes} voxels, more than the {MAX_VOXELS} that are read"
+        raise InputDataError(f"the header of '{path}' {flaw}; crop the image to the organs, or the header is damaged")
+    if needed > available:
+        flaw = f"promises {needed} bytes ({sizes} voxels), which the file cannot hold"
+        raise InputDataError(f"the header of '{path}' {flaw}; it is cut short or damaged: export or copy it again")
 
 
-def read_exactly(stream: Stream, n_bytes: int, path: Path) -> NDArray[np.uint8]:
+def read_exactly(stream: io.BufferedIOBase, n_bytes: int, path: Path) -> NDArray[np.uint8]:
     """The next bytes (n_bytes,) of the stream; pages of the buffer are only taken as the data come.
 
     Raises `InputDataError` when it ends before.
     """
-    buffer = np.empty(n_bytes, dtype=np.uint8)
-    done = 0
-    while done < n_bytes:
-        chunk = stream.read(min(CHUNK, n_bytes - done))
-        if not chunk:
-            raise InputDataError(
-                f"'{path}' is cut short: {n_bytes - done} of {n_bytes} bytes are missing; export or copy it again"
-            )
-        buffer[done : done + len(chunk)] = np.frombuffer(chunk, dtype=np.uint8)
-        done += len(chunk)
+    buffer, done = np.empty(n_bytes, dtype=np.uint8), 0
+    while done < n_bytes and (count := stream.readinto(buffer[done : done + CHUNK].data)):
+        done += count
+    if done < n_bytes:
+        flaw = f"{n_bytes - done} of {n_bytes} bytes are missing"
+        raise InputDataError(f"'{path}' is cut short: {flaw}; export or copy it again")
     return buffer
-
-
-class _Inflated:
-    """A zlib or gzip stream, unpacked no further than is asked for."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._inflate = zlib.decompressobj(47)  # 32 + 15: either head
-
-    def read(self, n: int) -> bytes:
-        """The next bytes, `n` at the most; none after the stream's end mark.
-
-        Raises `EOFError` when the file ends before that mark.
-        """
-        content = b""
-        while not content and not self._inflate.eof:
-            packed = self._inflate.unconsumed_tail or self._file.read(CHUNK)
-            content = self._inflate.decompress(packed, n)
-            if not content and not packed:
-                raise EOFError("the compressed voxels end before their end mark")
-        return content
-
-
-def gzip_stream(file: InputFile) -> BinaryIO:
-    """What is packed in the file from where it stands; no more is unpacked than is asked for."""
-    return io.BufferedReader(gzip.GzipFile(fileobj=file, mode="rb"))
-
-
-OPENED: dict[str, Callable[[InputFile], Stream]] = {
-    "raw": lambda file: file,
-    "gzip": gzip_stream,
-    "zlib": _Inflated,
-    "bzip2": bz2.BZ2File,
-}
