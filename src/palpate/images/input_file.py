@@ -101,9 +101,8 @@ def beside(path: Path, name: str) -> Path:
 
     Raises `InputDataError` where it leads elsewhere.
     """
-    folder = path.parent.resolve()
-    target = (folder / name).resolve()
-    if not target.is_relative_to(folder):
+    target = followed(path.parent / name, path.parent)
+    if target is None:
         raise InputDataError(f"'{path}' names a file outside its own folder, which is not read; put both into one")
     return target
 
