@@ -32,6 +32,7 @@ TELLING = 20  # points whose tissue tells where they went
 SEVERAL = 8  # points that tell how displacements change
 STRETCH = 0.5  # mm a mm, in every direction: more than any body's
 FLAT = 1e-6  # of the points' extent
+NEAR = 0.1  # of the body's farthest place from the origin: in a smaller unit any points shrink onto the origin
 CLEARLY = 0.4  # share of these by which another reading must agree better
 OTHERWISE = {
     "from the later state to the first: give those that lead from the first to the later one": -np.ones(3),
@@ -185,6 +186,7 @@ def refuse_slips(space: LagrangeSpace, points: NDArray[np.float64], inside: NDAr
     inside (n,): which of them lie in it.
     """
     share, points = float(inside.mean()), points[:: -(-len(inside) // MOST_POINTS)]
+    least = NEAR * np.abs(space.mesh.nodes).max()
     slips = {
         "x and y had the other sign: LPS read as RAS": points * LPS_TO_RAS,
         "they were written in metres": points * METRES,
@@ -192,7 +194,7 @@ def refuse_slips(space: LagrangeSpace, points: NDArray[np.float64], inside: NDAr
     }
     for words, other in slips.items():
         there = float(located(space.mesh, other).inside.mean())
-        if there > max(SLIP, share + SLIP):
+        if there > max(SLIP, share + SLIP) and np.abs(other).max() > least:
             raise InputDataError(
                 f"{share:.0%} of the points of '{path}' lie in the meshed body, and {there:.0%} would if {words};"
                 " tables of points are read as RAS mm: export it so"
