@@ -213,6 +213,7 @@ def test_tetrahedra_have_their_volume_whatever_the_order_of_their_corners(folder
         (("[mechanics]", '[tissues.hole]\nlabel = 2\nrole = "void"\n\n[mechanics]'), "solid ones alone"),
         (('name = "grip"', 'name = "floor"'), "one name"),
         (('[body]\nmesh = "bar.vtu"', '[phantom]\nkind = "spheres"'), "without a \\[body\\]"),
+        (("[[data]]", "[[data]]\nstate = 3"), "of state 1, of 3"),
     ],
 )
 def test_a_body_that_makes_no_sense_is_refused(folder, change, words):
