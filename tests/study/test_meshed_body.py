@@ -432,9 +432,9 @@ def grouped(folder, tmp_path):
     return read
 
 
-@pytest.mark.parametrize("write", [gmsh_2, gmsh_4])
-def test_a_triangle_in_two_groups_counts_in_both(grouped, write):
-    case = grouped(write=write)
+@pytest.mark.parametrize(("write", "top"), [(gmsh_2, "TOP"), (gmsh_4, "TOP"), (gmsh_4, "z_max")])
+def test_a_triangle_in_two_groups_or_a_plane_counts_in_both(grouped, write, top):
+    case = grouped(GROUPS.replace('where = "TOP"', f'where = "{top}"'), write=write)
     mesh = read_states(case).mesh
     normals = {name: triangle_normals(mesh.nodes, boundary_named(mesh, name)).sum(axis=0) for name in ("hand", "plate")}
     assert normals["hand"] == pytest.approx([0.0, 0.0, 200.0])

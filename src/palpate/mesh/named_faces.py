@@ -56,12 +56,12 @@ def listed_faces(faces: NDArray[np.int64], triangles: NDArray[np.int64], name: s
 
 
 def tissues_behind(
-    surfaces: Mapping[str, NDArray[np.bool_]], grouped: Sequence[str], tissues: Sequence[Tissue], n_faces: int
+    surfaces: Mapping[str, NDArray[np.bool_]], shared: Sequence[str], tissues: Sequence[Tissue], n_faces: int
 ) -> NDArray[np.int64]:
     """The hollow tissue (n_faces,), by its number, behind each boundary face; the last of `tissues` behind all others.
 
-    surfaces: faces (n_faces,) by the tissue's name; the first one counts where two have a face. grouped: those that
-    groups of the file name. Raises `GeometryError` for a surface without a face, or one that is free in part.
+    surfaces: faces (n_faces,) by the tissue's name; the first one counts where two have a face. shared: those that have
+    such faces, too. Raises `GeometryError` for a surface without a face, or one that is free in part.
     """
     behind, names = np.full(n_faces, len(tissues) - 1), [tissue.name for tissue in tissues]
     for name, faces in list(surfaces.items())[::-1]:
@@ -78,7 +78,7 @@ def tissues_behind(
                 f"all faces of the surface '{name}' belong to surfaces that are named before it; name it first, or"
                 " leave it out"
             )
-        if name in grouped and held and free[own].any():
+        if name in shared and held and free[own].any():
             raise GeometryError(
                 f"{free[own].sum()} of the {len(own)} faces of the surface '{name}' would be free, as they belong to"
                 f" '{names[int(own[free[own]][0])]}', which is named before it; name '{name}' first"
