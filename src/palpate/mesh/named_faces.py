@@ -48,9 +48,9 @@ def listed_faces(faces: NDArray[np.int64], triangles: NDArray[np.int64], name: s
     found = np.isin(number[: len(faces)], number[len(faces) :])
     if found.sum() < len(triangles):
         raise GeometryError(
-            f"{len(triangles) - found.sum()} of the {len(triangles)} triangles of the group '{name}' are no faces of"
-            " the mesh's boundary: they lie inside, between two tetrahedra, or are faces of none; name a group of outer"
-            " faces alone"
+            f"the group '{name}' has triangles that are no faces of the mesh's boundary, beside {found.sum()} that are:"
+            " they lie inside, between two tetrahedra, or are faces of none; name a group of outer faces alone, or save"
+            " the volume beside them, too (gmsh: in a physical group of its own)"
         )
     return np.asarray(found)
 
