@@ -225,6 +225,16 @@ def test_volume_cells_beside_tetrahedra_are_refused_by_number_and_kind(tmp_path,
         read_mesh_file(path)
 
 
+@pytest.mark.parametrize(("space", "signs"), [("RAS", [1, 1, 1]), ("LPS", [-1, -1, 1])])
+def test_a_vtk_of_3d_slicer_says_its_axes(tmp_path, space, signs):
+    of, path = block(), tmp_path / "m.vtk"
+    meshio.write(path, meshio.Mesh(of.nodes * signs, [("tetra", of.tets)]), file_format="vtk42")
+    version, _, rest = path.read_bytes().split(b"\n", 2)
+    path.write_bytes(b"\n".join([version, f"3D Slicer output. SPACE={space}".encode(), rest]))
+    read = read_mesh_file(path)
+    assert places(read.nodes, read.tets) == places(of.nodes, of.tets)
+
+
 def test_a_file_says_which_cell_data_it_has(tmp_path):
     of = block()
     meshio.write(

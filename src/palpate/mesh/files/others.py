@@ -88,7 +88,7 @@ def _read(path: Path) -> Any:
             return meshio.read(path)
     except SystemExit as error:  # and ends the program
         raise InputDataError(
-            f"meshio does not read it: {said.getvalue().strip()}; export it as .vtu or .msh"
+            f"meshio does not read it: {said.getvalue().strip()}; export it as .msh, or as .vtu without field data"
         ) from error
 
 
