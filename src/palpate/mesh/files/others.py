@@ -17,7 +17,17 @@ import numpy as np
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.mesh.files.elements import Elements, Name, Numbers
 
-GROUPS = ["tissue", "label", "region", "medit:ref", "gmsh:physical", "MaterialID", "material", "CellEntityIds"]
+GROUPS = [
+    "tissue",
+    "label",
+    "region",
+    "medit:ref",
+    "gmsh:physical",
+    "materialid",
+    "material",
+    "cellentityid",
+    "regionid",
+]
 GROUPS += ["tetgen:ref", "netgen:index", "nastran:ref", "avsucd:material", "ugrid:ref", "su2:tag"]
 DIMENSIONS = {"tetra": 3, "tetra10": 3, "triangle": 2, "triangle6": 2}
 Names = Callable[[int, int], Collection[Name]]  # the groups of elements of a dimension with a number
@@ -29,7 +39,8 @@ def read_by_meshio(path: Path, data: str | None) -> Elements:
     Raises `InputDataError` for what is no such file, `ConfigurationError` where meshio is not installed.
     """
     mesh = _read(path)
-    key = data or next((name for name in GROUPS if name in mesh.cell_data), None)
+    plain = {name.casefold().removesuffix("s"): name for name in mesh.cell_data}
+    key = data or next((plain[name] for name in GROUPS if name in plain), None)
     return _elements(mesh, key, lambda _, number: (number,))
 
 
@@ -101,8 +112,8 @@ def _elements(mesh: Any, key: str | None, names: Names) -> Elements:
         raise InputDataError(f"it has no cell data '{key}'; tissue_data may name one of {sorted(mesh.cell_data)}")
     for first, (kind, _), data in zip(firsts, blocks, mesh.cell_data.get(key, ()), strict=False):
         values = np.unique(data) if kind in DIMENSIONS else np.zeros(0)
-        if not np.array_equal(values, np.rint(values)):
-            raise InputDataError(f"its cell data '{key}' are no whole numbers; name others in tissue_data")
+        if not np.array_equal(values, np.rint(values)) or np.ndim(data) > 1:
+            raise InputDataError(f"its cell data '{key}' are no whole numbers, one a cell; name others in tissue_data")
         for value in values:
             for name in names(DIMENSIONS[kind], int(value)):
                 sets[name].append(first + np.flatnonzero(data == value))
