@@ -17,18 +17,8 @@ import numpy as np
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.mesh.files.elements import Elements, Name, Numbers
 
-GROUPS = [
-    "tissue",
-    "label",
-    "region",
-    "medit:ref",
-    "gmsh:physical",
-    "materialid",
-    "material",
-    "cellentityid",
-    "regionid",
-]
-GROUPS += ["tetgen:ref", "netgen:index", "nastran:ref", "avsucd:material", "ugrid:ref", "su2:tag"]
+GROUPS = ["tissue", "label", "region", "medit:ref", "gmsh:physical", "materialid", "material", "cellentityid"]
+GROUPS += ["regionid", "tetgen:ref", "netgen:index", "nastran:ref", "avsucd:material", "ugrid:ref", "su2:tag"]
 DIMENSIONS = {"tetra": 3, "tetra10": 3, "triangle": 2, "triangle6": 2}
 Names = Callable[[int, int], Collection[Name]]  # the groups of elements of a dimension with a number
 
