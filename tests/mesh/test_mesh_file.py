@@ -239,6 +239,29 @@ def test_arrays_outside_of_an_xdmf_files_folder_are_not_read(tmp_path):
             read_mesh_file(path)
 
 
+@pytest.mark.parametrize(("space", "signs"), [("RAS", [1, 1, 1]), ("LPS", [-1, -1, 1])])
+def test_a_vtk_of_3d_slicer_says_its_axes(tmp_path, space, signs):
+    of, path = block(), tmp_path / "m.vtk"
+    meshio.write(path, meshio.Mesh(of.nodes * signs, [("tetra", of.tets)]), file_format="vtk42")
+    version, _, rest = path.read_bytes().split(b"\n", 2)
+    path.write_bytes(b"\n".join([version, f"3D Slicer output. SPACE={space}".encode(), rest]))
+    read = read_mesh_file(path)
+    assert places(read.nodes, read.tets) == places(of.nodes, of.tets)
+
+
+@pytest.mark.parametrize("name", ["label", "Labels", "RegionId", "MaterialIDs", "CellEntityIds"])
+def test_cell_data_that_number_groups_are_found_by_their_usual_names(tmp_path, name):
+    of = block()
+    numbers = np.isin(np.arange(len(of.tets)), of.groups["STIFF"]) + 1
+    meshio.write(tmp_path / "m.vtu", meshio.Mesh(of.nodes, [("tetra", of.tets)], cell_data={name: [numbers]}))
+    groups = read_mesh_file(tmp_path / "m.vtu").groups
+    assert {number: len(own) for number, own in groups.items()} == {n: (numbers == n).sum() for n in (1, 2)}
+    both = {name: [np.stack([numbers, numbers], axis=1)]}
+    meshio.write(tmp_path / "m.vtu", meshio.Mesh(of.nodes, [("tetra", of.tets)], cell_data=both))
+    with pytest.raises(InputDataError, match="no whole numbers, one a cell"):
+        read_mesh_file(tmp_path / "m.vtu")
+
+
 def test_a_file_says_which_cell_data_it_has(tmp_path):
     of = block()
     meshio.write(

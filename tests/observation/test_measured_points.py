@@ -230,6 +230,15 @@ def test_another_unit_is_recognised(tmp_path, space, points, scale, words):
         source.on(space, no_force)
 
 
+def test_a_field_that_reaches_far_beyond_a_body_at_the_origin_is_in_no_other_unit(tmp_path):
+    body = lagrange_space(away(box_mesh(2, size=30.0), -15.0), "P1")
+    grid = np.stack(np.meshgrid(*[np.arange(-50.0, 51.0, 10.0)] * 3), axis=-1).reshape(-1, 3)
+    field = read(csv_of(tmp_path / "field.csv", grid, moved(grid)), kind="displacement-field")
+    term, _ = field.on(body, no_force)
+    motion = seen_by(term, (moved(body.points) - body.points).ravel())
+    assert np.abs(term.residuals(motion).values).max() < 1e-9
+
+
 def test_lps_read_as_ras_is_recognised(tmp_path, space, points):
     with pytest.raises(InputDataError, match="LPS"):
         read(csv_of(tmp_path / "m.csv", LPS * points, LPS * moved(points))).on(space, no_force)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.input_file import whole_input
+from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.named_labels import printable
 from palpate.mesh.cutting import face_pieces
 from palpate.mesh.files.abaqus import read_abaqus
@@ -25,6 +26,7 @@ from palpate.mesh.tetrahedralise import boundary_of
 READERS = {".msh": read_gmsh, ".inp": read_abaqus, ".med": read_med}
 READERS |= dict.fromkeys((".e", ".exo", ".ex2", ".exii", ".g", ".gen"), read_exodus)
 HOLLOW = ("vertex", "line", "tri", "quad", "polygon", "VTK_LAGRANGE_C", "VTK_LAGRANGE_TR", "VTK_LAGRANGE_Q")
+HEADING = 300  # bytes: the two lines with which .vtk begins, where 3D Slicer names the axes
 SLIVER = 1e-9  # volume over the cube of the longest edge
 JOINED = 1e-3  # of the shortest edge at a node: another one so near is meant to be the same
 
@@ -59,6 +61,8 @@ def read_mesh_file(path: Path, *, data: str | None = None) -> MeshFile:
         reader = None  # the ending is Fluent's, too
     try:
         read = reader(content, data) if reader else read_by_meshio(path, data)
+        if b"SPACE=LPS" in content[:HEADING]:  # which turns all tetrahedra, and mirrors none
+            read = replace(read, points=read.points * LPS_TO_RAS)
         return _sound(read, digest)
     except InputDataError as error:
         raise InputDataError(f"'{path}' is no mesh that is read: {error}") from error

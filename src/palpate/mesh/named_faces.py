@@ -45,21 +45,22 @@ def listed_faces(faces: NDArray[np.int64], triangles: NDArray[np.int64], name: s
     """
     number = np.unique(np.sort(np.concatenate([faces, triangles]), axis=1), axis=0, return_inverse=True)[1].ravel()
     found = np.isin(number[: len(faces)], number[len(faces) :])
-    if inner := len(triangles) - np.count_nonzero(found):
+    if np.count_nonzero(found) < len(triangles):
         raise GeometryError(
-            f"{inner} of the {len(triangles)} triangles of the group '{name}' are no faces of the mesh's boundary;"
-            " name a group of outer faces alone"
+            f"the group '{name}' has triangles that are no faces of the mesh's boundary, beside {found.sum()} that are:"
+            " they lie inside, between two tetrahedra, or are faces of none; name a group of outer faces alone, or save"
+            " the volume beside them, too (gmsh: in a physical group of its own)"
         )
     return np.asarray(found)
 
 
 def tissues_behind(
-    surfaces: Mapping[str, NDArray[np.bool_]], grouped: Sequence[str], tissues: Sequence[Tissue], n_faces: int
+    surfaces: Mapping[str, NDArray[np.bool_]], shared: Sequence[str], tissues: Sequence[Tissue], n_faces: int
 ) -> NDArray[np.int64]:
     """The hollow tissue (n_faces,), by its number, behind each boundary face; the last of `tissues` behind all others.
 
-    surfaces: faces (n_faces,) by the tissue's name; the first one counts where two have a face. grouped: those that
-    groups of the file name. Raises `GeometryError` for a surface without a face, or one that is free in part.
+    surfaces: faces (n_faces,) by the tissue's name; the first one counts where two have a face. shared: those that have
+    such faces, too. Raises `GeometryError` for a surface without a face, or one that is free in part.
     """
     behind, names = np.full(n_faces, len(tissues) - 1), [tissue.name for tissue in tissues]
     free = np.array([tissue.role is Role.VOID for tissue in tissues])
@@ -74,7 +75,7 @@ def tissues_behind(
             raise GeometryError(
                 f"all faces of the surface '{name}' belong to surfaces that are named before it; name it first"
             )
-        if name in grouped and not free[number] and len(lost):
+        if name in shared and not free[number] and len(lost):
             raise GeometryError(
                 f"{len(lost)} of the {len(own)} faces of the surface '{name}' would be free, as they belong to"
                 f" '{names[int(lost[0])]}', which is named before it; name '{name}' first"

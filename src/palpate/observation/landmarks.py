@@ -120,7 +120,8 @@ def _markups(content: str, path: Path) -> list[Marks]:
             lists.append(points)
     except (ValueError, RecursionError, LookupError, TypeError, AttributeError) as error:
         raise InputDataError(
-            f"'{path}' is no .mrk.json of 3D Slicer ({type(error).__name__}: {error}); export it again"
+            f"'{path}' is no markups file of 3D Slicer ({type(error).__name__}: {error}); landmarks are read from"
+            " .mrk.json and .fcsv, or from one .csv that has both points of each in a line (before_x ... after_z)"
         ) from error
     return lists
 

@@ -34,6 +34,7 @@ TELLING = 20  # points whose tissue tells where they went
 SEVERAL = 8  # points that tell how displacements change
 STRETCH = 0.5  # mm a mm, in every direction: more than any body's
 FLAT = 1e-6  # of the points' extent
+NEAR = 0.1  # of the body's farthest place from the origin: in a smaller unit any points shrink onto the origin
 CLEARLY = 0.4  # share of these by which another reading must agree better
 PLACES = {  # of points that were written otherwise, by what turns them
     "x and y had the other sign: LPS read as RAS": LPS_TO_RAS,
@@ -186,9 +187,10 @@ def checked_table(table: PointTable, path: Path) -> PointTable:
 def _refuse_slips(mesh: TetMesh, points: NDArray[np.float64], inside: NDArray[np.bool_], path: Path) -> None:
     """Raise `InputDataError` where points (n, 3) mm lie outside the mesh and a slip would explain that, or all do."""
     share, points = float(inside.mean()), points[:: -(-len(inside) // MOST_POINTS)]
+    least = NEAR * np.abs(mesh.nodes).max()
     for words, turn in PLACES.items():
         there = float(located(mesh, points * turn).inside.mean())
-        if there > max(SLIP, share + SLIP):
+        if there > max(SLIP, share + SLIP) and np.abs(points * turn).max() > least:
             raise InputDataError(
                 f"{share:.0%} of the points of '{path}' lie in the mesh, and {there:.0%} would if {words}; write RAS mm"
             )

@@ -217,9 +217,11 @@ class Case:
                 f"case '{self.id}' needs either [images] (with before and after) or [phantom], and not both; in place"
                 " of images a [body] with its mesh will do"
             )
-        if self.body is not None and not self.data:
+        bare = set(range(1, self.n_states + 1)) - {data.state for data in self.data}
+        if self.body is not None and bare:
+            of = f" of state {min(bare)}, of {self.n_states}" if self.data else ""
             raise ConfigurationError(
-                f"case '{self.id}' has a [body] and no [[data]]: without images measurements tell how it moved"
+                f"case '{self.id}' has a [body] and no [[data]]{of}: without images measurements tell how it moved"
             )
         if self.surfaces and self.body is None:
             raise ConfigurationError(

@@ -109,18 +109,21 @@ def _mesh(file: MeshFile, case: Case) -> TetMesh:
     """The mesh with the case's tissues, and a hollow one behind each named surface."""
     solid, region = _regions(file, case)
     tissues = (*solid, *(surface.behind for surface in case.surfaces), Tissue(OUTSIDE, Role.VOID))
-    faces, surfaces, grouped = boundary_of(file.tets), dict[str, NDArray[np.bool_]](), dict[str, NDArray[np.bool_]]()
+    faces, surfaces, shared = boundary_of(file.tets), dict[str, NDArray[np.bool_]](), dict[str, NDArray[np.bool_]]()
     for surface in case.surfaces:
-        if (group := _group(surface.where, file.surfaces)) is not None:
-            found = grouped[surface.name] = listed_faces(faces, group, surface.where)
+        group = _group(surface.where, file.surfaces)
+        if group is not None:
+            found = listed_faces(faces, group, surface.where)
         elif surface.where in (WHOLE, *PLANES):
             found = plane_faces(file.nodes, faces, surface.where, surface.within_mm)
         else:
             known = nearest(surface.where, [WHOLE, *PLANES, *map(str, file.surfaces)])
             raise ConfigurationError(f"the mesh has no surface '{surface.where}' for '{surface.name}': {known}")
         surfaces[surface.name] = found
-    behind = tissues_behind(surfaces, tuple(grouped), tissues, len(faces))
-    return TetMesh(file.nodes, file.tets, region, faces, behind, tissues, grouped)
+        if group is not None or surface.where != WHOLE:  # which is what others leave of it
+            shared[surface.name] = found
+    behind = tissues_behind(surfaces, tuple(shared), tissues, len(faces))
+    return TetMesh(file.nodes, file.tets, region, faces, behind, tissues, shared)
 
 
 def _regions(file: MeshFile, case: Case) -> tuple[list[Tissue], NDArray[np.int64]]:

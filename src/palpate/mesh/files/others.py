@@ -18,8 +18,8 @@ from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.input_file import beside
 from palpate.mesh.files.elements import CORNERS, Block, Elements, Name
 
-GROUPS = ["tissue", "label", "region", "medit:ref", "gmsh:physical", "MaterialID", "material", "CellEntityIds"]
-GROUPS += ["tetgen:ref", "netgen:index", "nastran:ref", "avsucd:material", "ugrid:ref", "su2:tag"]
+GROUPS = ["tissue", "label", "region", "medit:ref", "gmsh:physical", "materialid", "material", "cellentityid"]
+GROUPS += ["regionid", "tetgen:ref", "netgen:index", "nastran:ref", "avsucd:material", "ugrid:ref", "su2:tag"]
 Names = Callable[[int, int], Collection[Name]]  # the groups of elements of a dimension with a number
 
 
@@ -31,7 +31,8 @@ def read_by_meshio(path: Path, data: str | None) -> Elements:
     if path.suffix.lower() in (".xdmf", ".xmf"):
         _refuse_elsewhere(path)
     mesh = _read(path)
-    return _elements(mesh, data or next((name for name in GROUPS if name in mesh.cell_data), None))
+    plain = {name.casefold().removesuffix("s"): name for name in mesh.cell_data}
+    return _elements(mesh, data or next((plain[name] for name in GROUPS if name in plain), None))
 
 
 def _refuse_elsewhere(path: Path) -> None:
@@ -93,7 +94,9 @@ def _read(source: Path | io.BytesIO, kind: str | None = None) -> Any:
         with contextlib.redirect_stdout(io.StringIO()) as said:  # it prints why it does not read a file
             return meshio.read(source, kind)
     except SystemExit as error:  # and ends the program
-        raise InputDataError(f"meshio says: {said.getvalue().strip()}; export it as .vtu or .msh") from error
+        raise InputDataError(
+            f"meshio says: {said.getvalue().strip()}; export it as .msh, or as .vtu without field data"
+        ) from error
 
 
 def _elements(mesh: Any, key: str | None, names: Names = lambda _, number: (number,)) -> Elements:
@@ -107,8 +110,8 @@ def _elements(mesh: Any, key: str | None, names: Names = lambda _, number: (numb
             blocks.append((kind, np.asarray(data if kind in CORNERS else [()] * len(data), int), ()))
             continue
         values = mesh.cell_data[key][number]
-        if not np.array_equal(values, np.rint(values)):
-            raise InputDataError(f"its cell data '{key}' are no whole numbers; name others in tissue_data")
+        if np.ndim(values) > 1 or not np.array_equal(values, np.rint(values)):
+            raise InputDataError(f"its cell data '{key}' are no whole numbers, one a cell; name others in tissue_data")
         for value in np.unique(values):
             blocks.append((kind, np.asarray(data[values == value], int), names(CORNERS[kind] - 1, int(value))))
     for tag, families in getattr(mesh, "point_tags", {}).items():
