@@ -34,6 +34,11 @@ CASES = {
     "on another grid": (other_grid, 0, ""),
     "masks": (masks, 0, ""),
     "a cavity under pressure": (under_pressure, 0, ""),
+    "a load on nothing": (
+        lambda f: changed(f, "[estimate]", PRESSURE.replace('"rectum"', '"rektum"')),
+        2,
+        "no surface of the mesh is called 'rektum'",
+    ),
     "one bone": (as_bone, 2, "nothing moves this body"),
     "a second pair without its image": (second_pair, 3, "there is no file"),
     "an unknown solver": (lambda f: changed(f, *FIXED[:1], FIXED[0] + '\nsolver = "best"'), 2, "solver"),

@@ -39,7 +39,8 @@ CLEARLY = 0.4  # share of these by which another reading must agree better
 PLACES = {  # of points that were written otherwise, by what turns them
     "x and y had the other sign: LPS read as RAS": LPS_TO_RAS,
     "they were written in metres": np.full(3, 1e3),
-    "they were written in micrometres": np.full(3, 1e-3),
+    "they were written in centimetres": np.full(3, 10.0),
+    "they were written in micrometres, or the mesh in metres": np.full(3, 1e-3),
 }
 MOTIONS = {
     "as they are written": np.ones(3),

@@ -23,7 +23,7 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.study.case import Case
 from palpate.study.cost import image_memory_gb, machine_memory_gb
 
-ORGANS = (Role.ESTIMATE, Role.DRIVER)
+ORGANS, MESHED = (Role.ESTIMATE, Role.DRIVER), (Role.ESTIMATE, Role.KNOWN)
 LINEAR_RANGE = 0.10  # principal strain: beyond it the squares that the linear law leaves out are tenths of it
 MOST_BEYOND = 0.01  # share of the meshed volume
 NOTHING_MOVES = (
@@ -35,7 +35,10 @@ MOVES_MM = 1e-6  # less is rounding
 
 
 def refuse_what_cannot_be_estimated(case: Case) -> None:
-    """Say before any image is read that there is no later state, or that nothing can move: `ConfigurationError`."""
+    """Say before any image is read what no image mends: `ConfigurationError`.
+
+    There is no later state, nothing can move, or a load or force acts on a surface that the case has not.
+    """
     if case.images is not None and not case.images.after:
         raise ConfigurationError(
             "the key 'after' is missing in [images]; an estimate needs one or more later states of the body"
@@ -48,6 +51,13 @@ def refuse_what_cannot_be_estimated(case: Case) -> None:
     movers = [tissue for tissue in case.tissues if tissue.role in (Role.DRIVER, Role.RIGID)]
     if case.tissues and case.images is not None and not movers and not case.loads and not case.data:
         raise ConfigurationError(NOTHING_MOVES)
+    surfaces = [t.name for t in case.tissues if t.role not in MESHED] + [surface.name for surface in case.surfaces]
+    named = [load.surface for load in case.loads if load.surface] + [of.surface for of in case.data if of.surface]
+    lost = [name for name in named if name not in (*surfaces, "outer", "outside")]
+    if lost and case.phantom is None:
+        raise ConfigurationError(
+            f"no surface of the mesh is called '{lost[0]}'; those that can be loaded are {sorted(surfaces)} and 'outer'"
+        )
 
 
 def refuse_still(case: Case, *pairs: tuple[Segmentation, Sequence[Mapping[int, Motion]]]) -> None:
