@@ -83,7 +83,7 @@ def _sound(read: Elements, digest: str) -> MeshFile:
         raise InputDataError(f"it holds {dict(count)} and no tetrahedra; export a volume mesh of 4 or 10 nodes a cell")
     if others := [f"{n} {kind}" for kind, n in count.items() if kind not in CORNERS and not kind.startswith(HOLLOW)]:
         also = ", ".join(others)
-        raise InputDataError(f"beside {len(tets)} tetrahedra it has {also}: split these into some of 4 or 10 nodes")
+        raise InputDataError(f"beside {len(tets)} tetrahedra it has {also}: split these into tetrahedra")
     corners = np.concatenate([tets.ravel(), triangles.ravel(), points.ravel()])
     if corners.min() < 0 or corners.max() >= len(read.points) or read.points.shape[1] != 3:
         raise InputDataError(f"its elements name nodes that it has not ({len(read.points)} nodes); export it again")
