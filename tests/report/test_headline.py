@@ -41,6 +41,12 @@ def test_every_tissue_is_named_once_with_what_its_verdict_means():
     assert said.count("organ") == 3
 
 
+def test_data_that_are_missed_stand_in_the_banner():
+    missed = document("weak") | {"warnings": [{"code": "data-misfit", "message": "b"}]}
+    assert any("misses some of the data" in sentence for sentence in headline(missed).sentences)
+    assert not any("misses" in sentence for sentence in headline(document("weak", warnings=1)).sentences)
+
+
 @pytest.mark.parametrize(
     ("count", "words"),
     [

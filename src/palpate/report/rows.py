@@ -33,9 +33,10 @@ FEWEST_MARKS = 3  # on a scale that can be read
 FADING = 0.6  # of a cause's opacity, that of the next one on the bar
 FOUND = {
     "identified": "The images fix the stiffness of {}.",
-    "weak": "The images say little about the stiffness of {}: use the interval, not the number alone.",
+    "weak": "The stiffness of {} is less sure: use the interval, not the number alone.",
     "ratio only": "The images fix the stiffness of {} as a ratio to the others, not as a number of kilopascals.",
 }
+MISSED = "The fitted model misses some of the data by more than their errors: the interval does not cover that."
 OPEN = "The images do not fix the stiffness of {}: do not use {}."
 
 
@@ -278,6 +279,7 @@ def headline(document: Mapping[str, Any]) -> Headline:
     for item in moduli_in(document):
         verdicts.setdefault(item["verdict"], []).append(item["tissue"])
     sentences = [FOUND[verdict].format(listed(verdicts[verdict])) for verdict in FOUND if verdict in verdicts]
+    sentences += [MISSED] * any(warning["code"] == "data-misfit" for warning in document["warnings"])
     sentences += _of_starts([start["minimum"] for start in document["starts"]])
     if lost := verdicts.get("not identified"):
         title = OPEN.format(listed(lost), "its number" if len(lost) == 1 else "their numbers")
