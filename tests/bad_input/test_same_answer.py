@@ -29,6 +29,12 @@ def second_pair(folder):
     changed(folder, "[tissues.prostate]", text)
 
 
+def damaged_grey(folder):
+    """A grey image that only the report would show."""
+    (folder / "grey.nii.gz").write_bytes(b"these are words")
+    changed(folder, '["after.nii.gz"]', '["after.nii.gz"]\nintensities_before = "grey.nii.gz"')
+
+
 CASES = {
     "good": (lambda _: None, 0, ""),
     "on another grid": (other_grid, 0, ""),
@@ -39,6 +45,7 @@ CASES = {
         2,
         "no surface of the mesh is called 'rektum'",
     ),
+    "a damaged grey image": (damaged_grey, 0, ""),
     "one bone": (as_bone, 2, "nothing moves this body"),
     "a second pair without its image": (second_pair, 3, "there is no file"),
     "an unknown solver": (lambda f: changed(f, *FIXED[:1], FIXED[0] + '\nsolver = "best"'), 2, "solver"),

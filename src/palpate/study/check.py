@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from palpate.errors import InputDataError, PalpateError, ResourceError
+from palpate.errors import PalpateError, ResourceError
 from palpate.findings import Finding, of_pair, one_a_cause, rank
 from palpate.images.checks import (
     OBSERVED,
@@ -259,7 +259,7 @@ def _remarks(problems: _Problems, case: Case, pairs: Sequence[ImagedStates]) -> 
     for grey in _grey_images(case):
         try:
             read_intensities(grey)
-        except InputDataError as error:
+        except PalpateError as error:
             problems.add(Problem("report", f"the report will show labels in place of the grey image: {error}"))
 
 
