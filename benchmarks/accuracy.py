@@ -1,4 +1,4 @@
-"""How near the estimates come to the truth: same mesh, other mesh, voxels, noise, a tumour, a small filling.
+"""The errors of estimates against the truth: same mesh, other mesh, voxels, noise, a tumour, a small filling.
 
     python benchmarks/accuracy.py [--rows clean,noise,...] [--cases N] [--first-seed S] [--output FILE] [--json]
 

@@ -1,10 +1,10 @@
-"""Work that computes nothing, to see what the scheduling of a cohort costs and whether it holds.
+"""Work that computes nothing, to measure and test the scheduling of a cohort.
 
     python benchmarks/cohort_stub.py plan --rows 10000              # a plan of stub work: seconds and memory
     python benchmarks/cohort_stub.py run TABLE OUTPUT [--resume]    # what cohort_kills.py --stub starts
 
 Each row sleeps for a moment and writes a result.json of the size of a real one, through the same staging, lock and
-mark. It says nothing of estimates.
+mark. It does not measure estimates.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The rows of coverage.py: bodies with a known truth, the errors of their drawings, and what is measured besides."""
+"""The rows of coverage.py: bodies with a known truth, errors of their drawn surfaces, and further measurements."""
 
 from __future__ import annotations
 

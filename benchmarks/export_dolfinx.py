@@ -1,4 +1,4 @@
-"""What dolfinx reads of palpate.msh and palpate.xdmf, a line of JSON; export_meshes.py runs it in Debian's Python."""
+"""dolfinx reads palpate.msh and palpate.xdmf; prints a line of JSON. export_meshes.py runs it in Debian's Python."""
 
 from __future__ import annotations
 

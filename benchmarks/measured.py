@@ -1,4 +1,4 @@
-"""Young's moduli of bodies whose stiffness, or its ratio, was measured otherwise: no simulation in it.
+"""Young's moduli of measured bodies, whose stiffness, or its ratio, is known from another source. Not simulated.
 
     python benchmarks/measured.py NAME --data FOLDER [--fit STEPS] [--predict STEPS] [--foot N] [--map] [--alike UM]
         [--bead-sd UM] [--json] [--plot FILE.svg]
@@ -18,7 +18,7 @@ NAME is one of
             --map the inner part's modulus is a field: how far it is from flat, beside its own intervals. --bead-sd
             (0.2) and --alike (0): standard deviation of the errors, and length over which they are alike, um.
 
-Nothing of FOLDER is copied anywhere. Needs meshio: pip install 'palpate[mesh]'.
+Nothing of FOLDER is copied. Needs meshio: pip install 'palpate[mesh]'.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The most memory that this program has held."""
+"""The peak memory of this process."""
 
 from __future__ import annotations
 

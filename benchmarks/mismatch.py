@@ -1,4 +1,4 @@
-"""How near the estimates come to the truth where a pair of images does what real ones do, and the model does not.
+"""The errors of estimates from image pairs with the faults of real ones, which the model does not have.
 
     python benchmarks/mismatch.py [--scenes still,crop,...] [--laws linear,neo-hookean] [--noise clean,0.3] [--bodies N]
         [--first-seed S] [--share k/n] [--scenes-cache FOLDER] [--output FILE.jsonl] [--set key=value ...]

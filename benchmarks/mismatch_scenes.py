@@ -1,4 +1,4 @@
-"""The scenes of mismatch.py: simulated pelves whose images do what real pairs do, each a folder with a case.toml.
+"""The scenes of mismatch.py: simulated pelves with the faults of real image pairs, each a folder with a case.toml.
 
 A truth is a random pelvis in a field of 140 x 146 x 146 mm, solved on a mesh finer than the estimate's; scenes of one
 body share it. Truths and scenes are made once and kept in a folder: `scene_folder` gives the scene, made or not.

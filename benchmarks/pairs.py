@@ -1,4 +1,4 @@
-"""What further image pairs of a patient are worth, and what one spoilt pair costs.
+"""How much further image pairs of a patient reduce the error, and how much one spoilt pair adds.
 
     python benchmarks/pairs.py [--patients 20] [--first-seed 701] [--law linear] [--output FILE] [--json]
 

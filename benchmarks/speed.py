@@ -1,10 +1,10 @@
-"""How fast: an estimate in forward solves, the online gradient beside its peers, the posterior, the cost by mesh size.
+"""Speed: an estimate in forward solves, gradients beside those of other programs, the posterior, the cost by mesh size.
 
     python benchmarks/speed.py [--parts solver,linear,nonlinear,gradient,...] [--quick] [--json]
 
 The body is a simulated pelvis with prostate and bladder to estimate, seen through voxels, with 90 modes of the rectum's
-wall. What is compared is measured in one run, alternating. A peer that is not installed gives null; `make
-benchmark-setup` installs them. Simulated data.
+wall. Compared programs run in turns. A program that is not installed gives null; `make benchmark-setup` installs
+them. Simulated data.
 """
 
 from __future__ import annotations
