@@ -98,7 +98,7 @@ def _means(
         return sparse.csr_matrix(shares, shape=(len(counts), len(points))), alone
     order, k = np.argsort(number, kind="stable"), min(TOGETHER, int(counts.max()))
     starts = np.cumsum(counts) - counts
-    spread = np.arange(k) / max(k - 1, 1)  # spread over the cell's points in their order; with fewer points some are taken twice
+    spread = np.arange(k) / max(k - 1, 1)  # over the cell's points; with fewer, some are taken twice
     groups = order[starts[:, None] + np.rint(spread * (counts[:, None] - 1)).astype(np.int64)]
     entries = (np.full(groups.size, 1.0 / k), (np.repeat(np.arange(len(groups)), k), groups.ravel()))
     return sparse.csr_matrix(entries, shape=(len(groups), len(points))), whitener(points[groups], length)
