@@ -19,12 +19,12 @@ from palpate.study.poisson_ratios import PoissonRatioEstimate
 
 T = TypeVar("T", ModulusEstimate, PoissonRatioEstimate)
 
-CHANCE = 1e-3  # that errors as they are believed to be look so: of ten kinds of data, a false alarm in a hundred runs
-RELEVANT = 1.5  # times what noise explains: less, however sure, hardly moves a modulus
-DIRECTIONS = 30.0  # independent tests that the worst of all directions stands for: by simulation, of 1 to 200 points
+CHANCE = 1e-3  # probability of a false alarm for each kind of data: with ten kinds, one in a hundred runs
+RELEVANT = 1.5  # times the noise; a smaller misfit, however certain, hardly changes a modulus
+DIRECTIONS = 30.0  # number of independent tests to which the worst direction amounts, by simulation of 1 to 200 points
 TAIL, MOST = 0.05, 0.5  # shares of the data that lie far off: too many by chance, and too many to be named one by one
 AXES = ("x (right)", "y (anterior)", "z (superior)")
-ALONG = 0.9  # cosine to an axis, from which on a direction is told as that axis
+ALONG = 0.9  # cosine to an axis, above which a direction is named as that axis
 
 
 @dataclass(frozen=True, slots=True)

@@ -253,8 +253,7 @@ def _inputs(
 ) -> tuple[_Input, ...]:
     """Poisson's ratio of each tissue and of all, each observed surface, known moduli where several set the scale.
 
-    A surface whose offset is an unknown of the estimate is none of them: no step from there says what another offset
-    would be found.
+    Surfaces whose offset is an unknown of the estimate are left out, because a step cannot change their offset.
     """
     objective, minimum = inversion.objective, inversion.minimum
     model = objective.states[0].model
@@ -298,7 +297,7 @@ def _poisson_steps(ratio: float) -> tuple[float, float]:
 
 
 def _exact(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Variation]:
-    """The known modulus, where it alone sets the scale: every other one is proportional to it."""
+    """The exact effect of the known modulus where it alone sets the scale: all others are proportional to it."""
     mapping = inversion.objective.parameters
     known = list(dict.fromkeys(tissue.name for tissue in tissues if tissue.role is Role.KNOWN))  # layers are of theirs
     loaded = any(state.model.load.any() for state in inversion.objective.states)

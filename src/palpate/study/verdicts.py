@@ -172,7 +172,7 @@ def _without(sd: float, interval: Interval, value: float, *, centre: float) -> I
 
 
 def _stated(interval: Interval, word: str, unit: float = 1.0) -> Interval | None:
-    """The interval, times a unit, that a verdict lets stand: of what is not identified there is none."""
+    """The interval times a unit; none for a modulus that is not identified."""
     low, high = interval
     return None if word == NOT_IDENTIFIED else (low and low * unit, high and high * unit)
 
