@@ -319,7 +319,7 @@ class Objective:
         return self.parameters.by_unknowns(np.eye(n + n_modes)[kept], unknowns)
 
     def _offsets(self, s: int, unknowns: NDArray[np.float64]) -> list[float]:
-        """The offset of each observation of a state, 0 of those that have none."""
+        """The offset of each observation of a state, 0 where it has none."""
         known = dict(zip(self.parameters.offset_names(s), self.parameters.offsets(unknowns, s).tolist(), strict=True))
         return [known.get(o.name, 0.0) for o in self.states[s].observations]
 

@@ -90,7 +90,7 @@ class ReducedModel:
         return np.asarray(np.sum(found, axis=0))
 
     def _by_rows(self, work: Callable[[slice], NDArray[np.float64]], n: int, numbers: int) -> list[NDArray[np.float64]]:
-        """What work makes of ranges of n rows, each by a thread where products with so many numbers are worth it."""
+        """Results of `work` for ranges of n rows, by threads where there are enough products."""
         if n * numbers < WORTH_THREADS:
             return [work(slice(0, n))]
         return mapped(

@@ -77,7 +77,7 @@ def _nifti(path: Path, axes: str) -> Field:
     signs, positions = _nifti_kind(content.header, axes, path)
     n_x, n_y, n_z = content.values.shape[:3]
     grid = VoxelGrid((n_x, n_y, n_z), nifti_affine(content.header, path))
-    with np.errstate(all="ignore"):  # what is not finite is none
+    with np.errstate(all="ignore"):  # values that are not finite count as missing
         vectors = content.values.reshape(n_x, n_y, n_z, 3) * signs * nifti_millimetres(content.header, path)
     if positions:
         vectors[~vectors.any(axis=-1)] = np.nan
@@ -106,7 +106,7 @@ def _nifti_kind(header: Any, axes: str, path: Path) -> tuple[NDArray[np.float64]
 
 
 def _nrrd(path: Path, axes: str) -> Field:
-    """Vectors in the measurement frame; where there is none, as ITK has them in LPS: the format leaves them open."""
+    """Vectors in the measurement frame; without one in LPS as in ITK, because the format does not say."""
     array, header = nrrd_content(path)
     space, unit = str(header["space"]).lower(), MILLIMETRES[header.get("space units", ["mm"])[0]]
     if space not in RAS_SIGNS:

@@ -223,7 +223,7 @@ def _pair_sums(
     counts: NDArray[np.float64],
     between: tuple[int, int],
 ) -> NDArray[np.float64]:
-    """What `_binned_products` has of different cells so far apart (mm), each of which stands for `counts` (n_cells,).
+    """The part of `_binned_products` by pairs of cells at these distances (mm), each counted `counts` (n_cells,) times.
 
     values (n_cells,) mm, centres (n_cells, 3) mm, normals (n_cells, 3). A pair counts twice.
     """

@@ -29,7 +29,7 @@ STATED = (
     "motion-below-noise",
     "sides-exchanged",
     "front-exchanged",
-)  # findings on contacts stand in the result as observed shares
+)  # findings on contacts are in the result as observed shares
 
 
 @dataclass(frozen=True, slots=True)

@@ -116,7 +116,7 @@ def _of_points(line: Linearisation, motions: PointMotions) -> Misfit | None:
         return Misfit(name, line.state, times, short, text, whole=False)
     if smooth[0] > max(times, limit):
         (times, direction), scaled = smooth, alone
-    along = left.T @ (scaled @ direction)  # in space, whatever the errors' covariance makes of it
+    along = left.T @ (scaled @ direction)  # the direction in space, from that of the scaled residuals
     along *= np.sign(along[np.abs(along).argmax()]) / np.linalg.norm(along)
     words = "".join(axis for axis, cosine in zip(AXES, along, strict=True) if cosine > ALONG)
     words = words or f"({', '.join(f'{cosine:.2f}' for cosine in along)})"
@@ -188,7 +188,7 @@ def _worst_direction(scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.flo
 
 
 def _limit(count: float, directions: float) -> float:
-    """Root mean square of so many independent residuals of standard deviation 1 that tells of more than noise."""
+    """Root mean square of so many independent residuals of standard deviation 1 that noise hardly exceeds."""
     return max(RELEVANT, float(np.sqrt(chi2.isf(CHANCE / directions, count) / count)))
 
 

@@ -150,7 +150,7 @@ def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
 def _what_would_change(
     inversion: Inversion, settings: InversionSettings, case: Case, bodies: tuple[Body, ...]
 ) -> tuple[Variation, ...]:
-    """What the estimate of a case rests on; nothing where not even the estimate itself can be followed.
+    """What would change the estimate of a case; nothing where the estimate itself cannot be followed.
 
     A finite-strain law is compared with other finite-strain laws, the linear law with the default one. A step from
     finite strain cannot reach the linear law, nor a law under which the reference state would differ, too.

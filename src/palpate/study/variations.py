@@ -87,7 +87,7 @@ class SobolResult:
 
 @dataclass(frozen=True, slots=True)
 class _Input:
-    """One thing that can be changed by an amount: errors of the residuals for a unit of it."""
+    """One input that can be changed by an amount, with the residuals' changes for a unit of it."""
 
     cause: str
     subject: str
@@ -203,7 +203,7 @@ def sobol_result(
     of = _inputs(inversion, _equilibria(inversion), tissues, dilatation, voxel_mm)
     inputs = [each for each in of if each.subject != ALL]
     ranges = [Range(i.cause, i.subject, min(i.amounts)[0], max(i.amounts)[0], i.unit) for i in inputs]
-    # what changes no residual: a known modulus that alone sets the scale, and the drivers' prior
+    # inputs that change no residual: a known modulus that alone sets the scale, and the drivers' prior
     if _exact(inversion, tissues):
         (known,) = {tissue.name for tissue in tissues if tissue.role is Role.KNOWN}
         scale = float(np.log(KNOWN_FACTOR))
