@@ -112,7 +112,7 @@ def computing(roots: list[int]) -> list[int]:
 
 
 def victim(target: str, run: int, cluster: Cluster | None) -> int | None:
-    """A process to be killed; None where there is none of that kind at the moment."""
+    """A process to kill; None where none of that kind runs at the moment."""
     roots = [run] if cluster is None else cluster.pids("worker")
     choices = {
         "run": [run],
@@ -182,7 +182,7 @@ def disturbed(table: Path, output: Path, cluster: Cluster | None, target: str, a
 
 
 def fault(output: Path, reference: dict[str, Any]) -> str:
-    """What is wrong with a resumed run; empty when it is that which nobody disturbed."""
+    """How a resumed run differs from the undisturbed one; empty where it does not."""
     try:
         found = numbers_of(output)
     except PalpateError as error:

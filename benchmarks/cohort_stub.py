@@ -69,7 +69,7 @@ def plan(count: int, workers: int) -> dict[str, Any]:
 
 
 def _every(count: int) -> Any:
-    """A listener that tells of each tenth of the rows, and the memory by then."""
+    """A listener that reports each tenth of the rows and the memory so far."""
     seen = [0]
 
     def listen(message: str) -> None:

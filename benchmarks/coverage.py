@@ -58,7 +58,7 @@ Result = dict[str, Any]  # a line of JSON
 BodyKey = tuple[str, bool, str, str]  # truth, whether points are measured, the estimate's law and the truth's
 
 OUT = 2.0  # half-widths
-NEARLY = StopRule(step_sd=0.2)  # what an estimate may still move is little beside what noise does
+NEARLY = StopRule(step_sd=0.2)  # the stop rule moves an estimate much less than noise does
 CLEAN = NoiseModel(np.array([2.0 * 0.05**2]), np.array([3.0]))  # of the clean estimate: smaller than any row's
 MOST_TELLING = "field-0.2"  # by whose clean estimate all points are followed: it sees what the others see
 NO_GRID = 3  # draws of a voxel grid, in which nothing is off

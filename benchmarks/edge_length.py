@@ -108,7 +108,7 @@ def _first(found: list[dict[str, Any]], first_mm: float) -> dict[int, Any]:
 
 
 def _stated_beside_found(found: list[dict[str, Any]], first_mm: float) -> dict[str, Any]:
-    """Of each body and edge length, root mean squares over meshes and organs: off the first edge length, and stated."""
+    """For each body and edge length, root mean squares over meshes and organs: found deviation and stated one."""
     first, cases = _first(found, first_mm), []
     for key in dict.fromkeys((row["seed"], row["edge_mm"]) for row in found if row["edge_mm"] != first_mm):
         rows = [row for row in found if (row["seed"], row["edge_mm"]) == key]

@@ -63,7 +63,7 @@ def outcome(read: Callable[[], object], codes: set[int]) -> Outcome:
     began = time.perf_counter()
     kind, flaw = read_once(read, codes)
     seconds = time.perf_counter() - began
-    if seconds > SLOW_SECONDS:  # or the machine was busy: processor time tells, which is slow to ask for
+    if seconds > SLOW_SECONDS:  # or the machine was busy: processor time decides, which takes long to read
         began = time.thread_time()
         read_once(read, codes)
         seconds = time.thread_time() - began

@@ -38,7 +38,7 @@ from palpate.study import read_case
 
 SPACE = 32 * 2**20  # bytes of the small disk
 PAGE = 4096
-# modules whose functions are exchanged for ones that know the answer
+# modules whose functions are replaced by ones that return the known answer
 RUN: Any = importlib.import_module("palpate.study.run")
 NEW_CASE: Any = importlib.import_module("palpate.study.new_case")
 CASE_REPORT: Any = importlib.import_module("palpate.report.case_report")

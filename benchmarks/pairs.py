@@ -77,7 +77,7 @@ def _states(scene: Scene, after: LabelImage) -> ImagedStates:
 
 
 def _shifted(scene: Scene, rng: np.random.Generator) -> LabelImage:
-    """The later image with one organ drawn 3 mm beside its place, along a direction in the slice."""
+    """The later image with one organ drawn 3 mm away from its place, along a direction in the slice."""
     label = scene.mesh.tissue_index(SHIFTED) + 1
     rest = scene.mesh.tissue_index("surroundings") + 1
     axis, sign = int(rng.integers(2)), int(rng.choice([-1, 1]))

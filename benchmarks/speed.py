@@ -358,19 +358,19 @@ def _default(sizes: Sizes, seed: int, say: Say) -> Result:
 
 
 def _signals(sizes: Sizes, seed: int, say: Say) -> Result:
-    """The same beside cases whose images tell more or less."""
+    """The same, with cases whose images contain more or less information."""
     del say
     return {"signals": other_signals(seed, quick=sizes == QUICK)}
 
 
 def _field(sizes: Sizes, seed: int, say: Say) -> Result:
-    """The same with a measured displacement field beside its surfaces."""
+    """The same with a measured displacement field in addition to surfaces."""
     del say
     return {"field": measured_field(seed, quick=sizes == QUICK)}
 
 
 def _map(sizes: Sizes, seed: int, say: Say) -> Result:
-    """What a map of the prostate's stiffness adds to that, and a small one beside torch-fem's of the same data."""
+    """The cost of a map of the prostate's stiffness, and a small map by Palpate and by torch-fem."""
     peer = beside_a_peer(*sizes.map, seed, say)
     return {"map": mapped_organ(seed, quick=sizes == QUICK), "map_beside_torch_fem": peer}
 
