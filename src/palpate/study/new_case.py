@@ -19,7 +19,7 @@ from palpate.images.tissue import Role
 from palpate.study.case_file import relative_path, toml_key, toml_text
 from palpate.study.case_tissue import REMAINING
 from palpate.study.earlier import CASE_NAME
-from palpate.study.guess import GuessedTissue, class_names, guess_tissues
+from palpate.study.guess import GuessedTissue, class_names, guess_tissues, movers_of
 from palpate.study.outputs import OutputFolder, read_regular, write_text
 from palpate.study.proposed_mesh import MARGIN_MM, background_of, proposed_edge, proposed_window
 
@@ -121,7 +121,8 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
                 " nothing can be estimated: check the two paths"
             )
     known = class_names(before)
-    tissues = guess_tissues(replace(before, names=known.names) if known.names else before, after)
+    named = replace(before, names=known.names) if known.names else before
+    tissues = guess_tissues(named, after)
     window = proposed_window(before, tissues)
     background = None  # label 0 where it is taken for surroundings
     if not any(0 in tissue.labels for tissue in tissues) and any(not tissue.labels for tissue in tissues):
@@ -130,9 +131,9 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
     if background is not None and background.has_air:
         name = next(name for name in ("air", "air around", "label 0") if name not in {t.name for t in guessed})
         tissues = (*guessed, GuessedTissue(name, (0,), Role.VOID, background.in_words))
-    questions = _questions(tissues)
-    named = zip((images.before, *images.after), (before, *after), strict=True)
-    notes = [f"'{path.name}': {finding.message}" for path, image in named for finding in image.findings]
+    questions = _questions(tissues, named, after)
+    read = zip((images.before, *images.after), (before, *after), strict=True)
+    notes = [f"'{path.name}': {finding.message}" for path, image in read for finding in image.findings]
     if known.names:
         notes.append(
             "the labels have no names; their numbers were taken for those of TotalSegmentator's task"
@@ -164,22 +165,22 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
     return NewCase(folder / CASE_NAME, "\n\n".join(blocks) + "\n", tissues, questions)
 
 
-def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
+def _questions(tissues: Sequence[GuessedTissue], before: LabelImage, after: Sequence[LabelImage]) -> tuple[str, ...]:
+    """Every role that could not be guessed, all in one question, then the guesses that the user is to confirm."""
     roles = {tissue.role for tissue in tissues}
-    asked = [
-        f'[tissues.{toml_key(t.name)}] role: {t.reason}; write role = "estimate", "known", "driver", "rigid" or'
-        ' "void" there'
-        for t in tissues
-        if t.role is None
-    ]
+    without = [tissue for tissue in tissues if tissue.role is None]
+    asked = []
+    if without:
+        names = ", ".join(f"[tissues.{toml_key(tissue.name)}]" for tissue in without)
+        reason = f" ({without[0].reason})" if len(without) == 1 else ""
+        asked.append(f'which role has {names}{reason}? Write role = "estimate", "known", "driver", "rigid" or "void"')
     asked += [f"[tissues.{toml_key(t.name)}] role: {t.question}" for t in tissues if t.question]
     if Role.ESTIMATE not in roles:
         asked.append('no organ was found to estimate; give role = "estimate" to the tissues whose stiffness you want')
     if Role.DRIVER not in roles:
         asked.append(
-            'nothing was found that moves the organs; give role = "driver" to the hollow organ whose wall deforms the'
-            " others (TotalSegmentator has no class for the rectum: segment it in all images, as a label of its own,"
-            " or as rectum.nii.gz in a folder of masks)"
+            'nothing was found that moves the organs; give role = "driver" to what moves them, for example'
+            f" {movers_of(before, after)}"
         )
     if Role.KNOWN not in roles:
         asked.append(
