@@ -85,7 +85,7 @@ def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Finding, ...
         closest = min(entries, key=lambda entry: min(abs(value - entry.low), abs(value - entry.high)))
         text = (
             f"{name}: {value:.3g} kPa lies more than {MARGIN:g} times outside the published"
-            f" range for {closest.tissue}, {low:g} to {high:g} kPa (nearest source: {closest.reference})."
+            f" range for {closest.tissue}, {low:g} to {high:g} kPa ({closest.reference})."
             " Check the modulus of the `known` tissue, the labels and the boundary"
         )
         found.append(Finding("implausible-stiffness", text))
