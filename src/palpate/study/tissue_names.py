@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import lru_cache
 
 SPELLINGS = (
     ("tumor", "tumour"),
@@ -15,6 +16,7 @@ SPELLINGS = (
 LEAST_PLURAL = 4  # letters of a word whose final s is not counted
 
 
+@lru_cache(maxsize=4096)
 def plain_name(name: str) -> str:
     """The words of a name in one spelling, each between two underscores: "_kidney_" of "Kidneys" or "kidney 2"."""
     parts = re.sub(r"[^a-z]+", " ", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower()).split()
