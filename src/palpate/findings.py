@@ -25,6 +25,7 @@ Misleading = Literal[
     "linear-strains",
     "weightless-reference",
     "volume-change",
+    "relaxed-state",
     "void-moves",
     "drawn-otherwise",
     "layer",

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
 from palpate.findings import Finding
-from palpate.images.checks import check_headers, check_images, check_pair, check_segmentation, refuse_absent
+from palpate.images.checks import (
+    check_headers,
+    check_images,
+    check_pair,
+    check_segmentation,
+    refuse_absent,
+    refuse_unit,
+)
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_label_image
 from palpate.images.segmentation import Segmentation, segment
@@ -161,6 +168,30 @@ def test_a_change_of_volume_is_told_by_its_size(radius: float, code: str | None)
 
 def test_a_driver_may_fill() -> None:
     assert check_pair(BEFORE, body(radii={3: 10.0})) == ()
+
+
+@pytest.mark.parametrize(("radius", "asked"), [(9.0, False), (7.5, False), (6.0, True)])
+def test_a_driver_that_empties_by_much_is_asked_about(radius: float, asked: bool) -> None:
+    found = [f for f in check_images(BEFORE, [body(radii={3: radius})]) if f.code == "relaxed-state"]
+    assert [("shrinks by" in f.message, "is 'before' the relaxed state?" in f.message) for f in found] == (
+        [(True, True)] if asked else []
+    )
+
+
+def test_of_several_drivers_the_sum_tells_whether_they_empty() -> None:
+    """A bladder that empties while a stomach fills by more is no sign of exchanged images."""
+    drivers = tuple(replace(t, role=Role.DRIVER) if i == 2 else t for i, t in enumerate(TISSUES))
+    before, after = (replace(image, tissues=drivers) for image in (BEFORE, body(radii={2: 11.5, 3: 6.0})))
+    assert "relaxed-state" not in codes(check_images(before, [after]))
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1e-3, "metres"), (1e3, "micrometres")])
+def test_an_image_of_the_size_of_another_unit_is_refused(scale: float, unit: str) -> None:
+    affine = AFFINE * scale
+    affine[3, 3] = 1.0
+    with pytest.raises(InputDataError, match=f"seems to be in {unit}"):
+        refuse_unit(VoxelGrid(SHAPE, affine), "before")
+    refuse_unit(VoxelGrid(SHAPE, AFFINE), "before")
 
 
 def test_an_organ_that_moves_further_than_its_size_is_told() -> None:

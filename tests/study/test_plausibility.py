@@ -26,7 +26,7 @@ def test_names_find_their_tissue(name, tissue):
 
 
 def test_an_unknown_tissue_is_not_judged():
-    assert plausibility_warnings({"spleen": 1e6}) == ()
+    assert plausibility_warnings({"omentum": 1e6}) == ()
 
 
 @pytest.mark.parametrize("name", ["gallbladder", "gall bladder", "Gall-Bladder"])
@@ -86,5 +86,52 @@ def test_usual_units_pass(case_result):
 def test_what_did_not_converge_is_not_told_by_a_warning(case_result):
     first = dataclasses.replace(case_result.estimation.estimates[0], tissue="prostate", value=1e5)
     estimation = dataclasses.replace(case_result.estimation, estimates=(first,))
-    assert [warning.code for warning in estimate_warnings(estimation)] == ["implausible-stiffness"]
-    assert estimate_warnings(dataclasses.replace(estimation, status="not converged")) == ()
+    case = case_result.case
+    assert [warning.code for warning in estimate_warnings(case, estimation)] == ["implausible-stiffness"]
+    assert estimate_warnings(case, dataclasses.replace(estimation, status="not converged")) == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "tissue"),
+    [
+        ("liver_tumor", "liver tumour"),
+        ("LiverTumours", "liver tumour"),
+        ("breast cancer", "breast tumour"),
+        ("thyroid nodule", "thyroid nodule"),
+        ("uterine fibroid", "uterine fibroid"),
+        ("Kidney_L", "kidney"),
+        ("left lungs", "lung"),
+        ("LV myocardium", "heart muscle in diastole"),
+        ("breast_fat", "fat"),
+        ("fibroglandular tissue", "breast gland"),
+        ("Cerebral white matter", "brain"),
+    ],
+)
+def test_organs_and_their_tumours_have_their_own_range(name, tissue):
+    assert {entry.tissue for entry in published_for(name)} == {tissue}
+
+
+@pytest.mark.parametrize("name", ["tumour", "lesion 2", "kidney tumor", "brain_tumour", "hepatic vessel", "oesophagus"])
+def test_what_nobody_published_is_not_judged(name):
+    assert plausibility_warnings({name: 1e6}) == ()
+
+
+def test_every_warning_has_two_sentences_and_sixty_words_at_most():
+    for entry in PUBLISHED:
+        name = f"{entry.words.split()[0]} {'tumour' if entry.tumour else 'wall'}"
+        for warning in plausibility_warnings({name: 1e6}):
+            assert len(warning.message.split()) <= 60, warning.message
+
+
+@pytest.mark.parametrize(
+    ("known_kpa", "verdict", "warned"),
+    [(10.0, "identified", True), ((9.0, 11.0), "identified", True), ((1.3, 5.2), "identified", False),
+     (10.0, "ratio only", False), (10.0, "not identified", False)],
+)  # fmt: skip
+def test_no_modulus_is_judged_on_a_scale_that_is_a_guess(case_result, known_kpa, verdict, warned):
+    first = dataclasses.replace(case_result.estimation.estimates[0], tissue="prostate", value=1e5, verdict=verdict)
+    estimation = dataclasses.replace(case_result.estimation, estimates=(first,))
+    case: Case = case_result.case
+    known = dataclasses.replace(case.tissues[3], youngs_modulus_kpa=known_kpa)
+    case = dataclasses.replace(case, tissues=(*case.tissues[:3], known))
+    assert bool(estimate_warnings(case, estimation)) is warned

@@ -19,6 +19,7 @@ from palpate.images.tissue import Role, Tissue
 
 STILL_VOXELS = 0.15  # mean motion of a surface, in voxels, by rounding alone
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
+EMPTIED = 0.30  # of a driver's volume: a smaller loss is no question worth asking
 VOLUME_CHANGE = 0.05  # no modulus explains a filling between the scans
 VOLUME_IMPLAUSIBLE = 0.30  # volume change that no deformation, and hardly a filling, can make
 SMALL_VOXELS = 50
@@ -28,6 +29,7 @@ COMMON_SHARE = 0.5
 ON_FACE = 1e-6  # voxels: rounding of a point on an image's outer face
 FAR_SHARE = {Role.ESTIMATE: 0.5}  # of its size: a solid organ hardly moves further; others by all of it
 SPACING_MM = (0.02, 20.0)  # range of a voxel's edge; outside it is more likely in metres or micrometres
+LENGTH_MM = (2.0, 1e4)  # range of an image's longest side: outside it no body is imaged
 MIRROR_CERTAIN = 0.25  # gain in agreement (at most 1) at which an image is refused as mirrored
 MIRROR_LIKELY = 0.10
 MIRROR_SAMPLES = 4000
@@ -106,6 +108,17 @@ def check_headers(before: VoxelGrid, after: VoxelGrid, name: str) -> tuple[Findi
         " of which one gives the centre of the first voxel and the other its corner; compare both with the scanner's"
     )
     return (Finding("half-voxel", text, place=f"in '{name}'"),)
+
+
+def refuse_unit(grid: VoxelGrid, name: str) -> None:
+    """Raise `InputDataError` when the image called `name` has the size of one in another unit of length."""
+    length = float((np.array(grid.shape) * grid.spacing).max())
+    if not LENGTH_MM[0] <= length <= LENGTH_MM[1]:
+        unit, code, factor = ("metres", 1, 1000.0) if length < LENGTH_MM[0] else ("micrometres", 3, 0.001)
+        raise InputDataError(
+            f"'{name}' is {length:.3g} mm long at its longest side: its header seems to be in {unit}. Set the header's"
+            f" unit of length (NIfTI: xyzt_units = {code}), or multiply spacing and origin by {factor:g}"
+        )
 
 
 def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, ...]:
@@ -202,6 +215,7 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
         findings += _volume_change(before, after, i, name)
     for i in range(len(before.tissues)):
         findings += _moving_void(before, after, i, name)
+    findings += _emptied(before, after, name)
     return tuple(findings)
 
 
@@ -358,6 +372,23 @@ def _volume_change(before: Segmentation, after: Segmentation, i: int, name: str)
         text += "; so large a change is implausible for one organ: check that the label means the same in both images"
         return [Finding("volume-implausible", text, tissue.name, place)]
     return [Finding("volume-change", text, tissue.name, place)]
+
+
+def _emptied(before: Segmentation, after: Segmentation, name: str) -> list[Finding]:
+    """A question about `before` where all drivers together are smaller later, and one of them by much."""
+    drivers = [i for i, tissue in enumerate(before.tissues) if tissue.role is Role.DRIVER]
+    volumes = {i: (before.volume(i), after.volume(i)) for i in drivers}
+    if not drivers or sum(end - start for start, end in volumes.values()) >= 0.0:
+        return []
+    most = min(drivers, key=lambda i: volumes[i][1] / volumes[i][0])
+    loss, tissue = 1.0 - volumes[most][1] / volumes[most][0], before.tissues[most].name
+    if loss <= EMPTIED or any(_touching(image.mask(most)) for image in (before, after)):
+        return []
+    text = (
+        f"'{tissue}' shrinks by {loss:.0%} from 'before' to '{name}': is 'before' the relaxed state? If '{name}' is,"
+        " exchange the two images"
+    )
+    return [Finding("relaxed-state", text, tissue, f"to '{name}' ({loss:.0%})")]
 
 
 def _moving_void(before: Segmentation, after: Segmentation, i: int, name: str) -> list[Finding]:

@@ -17,6 +17,7 @@ from palpate.images.checks import (
     check_segmentation,
     later_names,
     refuse_absent,
+    refuse_unit,
 )
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities
@@ -338,6 +339,8 @@ def _checked_pair(
     An organ that is absent is named, and left out of the other checks; the images are then not aligned.
     """
     before, after = states.before, states.after
+    for name, image in zip(("before", *later_names(len(after))), (before, *after), strict=True):
+        problems.attempt(partial(refuse_unit, image.grid, name))
     problems.attempt(partial(refuse_absent, before, after))
     absent = set(absent_tissues(before, after))
     if not absent:

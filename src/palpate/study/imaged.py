@@ -11,7 +11,7 @@ import numpy as np
 from palpate.errors import InputDataError
 from palpate.findings import Finding
 from palpate.images.alignment import Alignment, Motion, align, moved
-from palpate.images.checks import check_headers, check_images, later_names, refuse_absent
+from palpate.images.checks import check_headers, check_images, later_names, refuse_absent, refuse_unit
 from palpate.images.registration import ON, Registration, registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.surface_alignment import align_surfaces, surface_maps
@@ -78,9 +78,11 @@ def aligned(
     """Bring the later images to the first (`method`: "rigid-tissues", "surfaces" or "none") and check them all.
 
     `loaded`: whether known loads act on the body, for what is found of its motion.
-    Raises `InputDataError` as `refuse_absent`, `align`, `check_images` and `refuse_lost` do, `GeometryError` as
-    `refuse_unmeshable`.
+    Raises `InputDataError` as `refuse_unit`, `refuse_absent`, `align`, `check_images` and `refuse_lost` do,
+    `GeometryError` as `refuse_unmeshable`.
     """
+    for name, image in zip(("before", *later_names(len(after))), (before, *after), strict=True):
+        refuse_unit(image.grid, name)
     refuse_absent(before, after)
     found = brought(before, after, method=method, progress=progress)
     progress("checking the images")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from palpate.errors import ConfigurationError, InputDataError
+from palpate.images.checks import EMPTIED, later_names, refuse_unit
 from palpate.images.label_image import LabelImage
 from palpate.images.label_table import read_label_table
 from palpate.images.named_labels import MAX_NAME, printable
@@ -19,7 +20,7 @@ from palpate.images.tissue import Role
 from palpate.study.case_file import relative_path, toml_key, toml_text
 from palpate.study.case_tissue import REMAINING
 from palpate.study.earlier import CASE_NAME
-from palpate.study.guess import GuessedTissue, class_names, guess_tissues
+from palpate.study.guess import GuessedTissue, class_names, guess_tissues, movers_of
 from palpate.study.outputs import OutputFolder, read_regular, write_text
 from palpate.study.proposed_mesh import MARGIN_MM, background_of, proposed_edge, proposed_window
 
@@ -28,11 +29,11 @@ WIDE_MM = 250.0  # of an image: more than the body of many, so that it must show
 GUESSED_WITHIN = 2.0  # times and by what a known modulus is guessed: measured ones of one tissue differ so
 LEAST_NAME = 3  # letters that images' names share, to be a case's name
 ROLES = (
-    "  estimate: its stiffness is wanted; its surface is looked at in all images",
-    "  known:    its youngs_modulus_kpa is given; the first one sets the scale of all results",
-    "  driver:   hollow; not meshed; the motion of its wall between the images moves the others",
-    "  rigid:    bone; not meshed; held, or moved as one body by what the images show",
-    "  void:     air, and what lies outside the body; not meshed; a free surface",
+    "  estimate: the stiffness of this tissue is wanted; its surface is compared in all images",
+    "  known:    you give the stiffness (youngs_modulus_kpa); the first known tissue sets the scale of all results",
+    "  driver:   a hollow organ; the motion of its wall between the images moves the other tissues",
+    "  rigid:    bone; it stands still, or moves as one body as the images show",
+    "  void:     air, and what lies outside the body; its surface is free",
 )
 
 
@@ -111,17 +112,10 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
     Raises `InputDataError` for images or a table that cannot be read, `ConfigurationError` for a path that TOML cannot
     hold.
     """
-    names = read_label_table(images.table) if images.table else None
-    before = read_label_image(images.before, names=names)
-    after = tuple(read_label_image(path, names=names) for path in images.after)
-    for path, image in zip(images.after, after, strict=True):
-        if np.array_equal(before.labels, image.labels):
-            raise InputDataError(
-                f"'{images.before}' and '{path}' are the same label image, voxel by voxel; without a deformation"
-                " nothing can be estimated: check the two paths"
-            )
+    before, after = _read(images)
     known = class_names(before)
-    tissues = guess_tissues(replace(before, names=known.names) if known.names else before, after)
+    named = replace(before, names=known.names) if known.names else before
+    tissues = guess_tissues(named, after)
     window = proposed_window(before, tissues)
     background = None  # label 0 where it is taken for surroundings
     if not any(0 in tissue.labels for tissue in tissues) and any(not tissue.labels for tissue in tissues):
@@ -130,9 +124,9 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
     if background is not None and background.has_air:
         name = next(name for name in ("air", "air around", "label 0") if name not in {t.name for t in guessed})
         tissues = (*guessed, GuessedTissue(name, (0,), Role.VOID, background.in_words))
-    questions = _questions(tissues)
-    named = zip((images.before, *images.after), (before, *after), strict=True)
-    notes = [f"'{path.name}': {finding.message}" for path, image in named for finding in image.findings]
+    questions = _questions(tissues, named, after)
+    read = zip((images.before, *images.after), (before, *after), strict=True)
+    notes = [f"'{path.name}': {finding.message}" for path, image in read for finding in image.findings]
     if known.names:
         notes.append(
             "the labels have no names; their numbers were taken for those of TotalSegmentator's task"
@@ -164,22 +158,39 @@ def new_case(images: CaseImages, folder: Path) -> NewCase:
     return NewCase(folder / CASE_NAME, "\n\n".join(blocks) + "\n", tissues, questions)
 
 
-def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
+def _read(images: CaseImages) -> tuple[LabelImage, tuple[LabelImage, ...]]:
+    """The label images; raises `InputDataError` where their unit of length seems wrong, or two are the same."""
+    names = read_label_table(images.table) if images.table else None
+    before = read_label_image(images.before, names=names)
+    after = tuple(read_label_image(path, names=names) for path in images.after)
+    refuse_unit(before.grid, str(images.before))
+    for path, image in zip(images.after, after, strict=True):
+        refuse_unit(image.grid, str(path))
+        if np.array_equal(before.labels, image.labels):
+            raise InputDataError(
+                f"'{images.before}' and '{path}' are the same label image, voxel by voxel; without a deformation"
+                " nothing can be estimated: check the two paths"
+            )
+    return before, after
+
+
+def _questions(tissues: Sequence[GuessedTissue], before: LabelImage, after: Sequence[LabelImage]) -> tuple[str, ...]:
+    """Every role that could not be guessed, all in one question, then the guesses that the user is to confirm."""
     roles = {tissue.role for tissue in tissues}
-    asked = [
-        f'[tissues.{toml_key(t.name)}] role: {t.reason}; write role = "estimate", "known", "driver", "rigid" or'
-        ' "void" there'
-        for t in tissues
-        if t.role is None
-    ]
+    without = [tissue for tissue in tissues if tissue.role is None]
+    asked = []
+    if without:
+        names = ", ".join(f"[tissues.{toml_key(tissue.name)}]" for tissue in without)
+        reason = f" ({without[0].reason})" if len(without) == 1 else ""
+        asked.append(f'which role has {names}{reason}? Write role = "estimate", "known", "driver", "rigid" or "void"')
     asked += [f"[tissues.{toml_key(t.name)}] role: {t.question}" for t in tissues if t.question]
+    asked += _emptied(tissues, before, after)
     if Role.ESTIMATE not in roles:
         asked.append('no organ was found to estimate; give role = "estimate" to the tissues whose stiffness you want')
     if Role.DRIVER not in roles:
         asked.append(
-            'nothing was found that moves the organs; give role = "driver" to the hollow organ whose wall deforms the'
-            " others (TotalSegmentator has no class for the rectum: segment it in all images, as a label of its own,"
-            " or as rectum.nii.gz in a folder of masks)"
+            'nothing was found that moves the organs; give role = "driver" to what moves them, for example'
+            f" {movers_of(before, after)}"
         )
     if Role.KNOWN not in roles:
         asked.append(
@@ -187,6 +198,22 @@ def _questions(tissues: Sequence[GuessedTissue]) -> tuple[str, ...]:
             " youngs_modulus_kpa to get kPa"
         )
     return tuple(asked)
+
+
+def _emptied(tissues: Sequence[GuessedTissue], before: LabelImage, after: Sequence[LabelImage]) -> list[str]:
+    """A question about `before` where all drivers together are smaller later, and one of them by much."""
+    drivers = [tissue for tissue in tissues if tissue.role is Role.DRIVER]
+    start, *later = (
+        np.array([np.count_nonzero(np.isin(image.labels, t.labels)) * image.grid.voxel_volume for t in drivers])
+        for image in (before, *after)
+    )
+    for name, end in zip(later_names(len(later)), later, strict=True):
+        if not drivers or end.sum() >= start.sum() or (end / start).min() > 1.0 - EMPTIED:
+            continue
+        most = int(np.argmin(end / start))
+        loss = f"'{drivers[most].name}' shrinks by {1.0 - end[most] / start[most]:.0%} from 'before' to '{name}'"
+        return [f"{loss}: is 'before' the relaxed state? If '{name}' is, exchange the two images"]
+    return []
 
 
 def _images(images: CaseImages, folder: Path, *, from_ct: bool) -> str:
@@ -224,8 +251,8 @@ def _tissue(tissue: GuessedTissue, before: LabelImage) -> str:
         else:
             low, high = value / GUESSED_WITHIN, value * GUESSED_WITHIN
             lines.append(
-                f"youngs_modulus_kpa = [{low:g}, {high:g}]  # {value:g} is a guess, this the range that 95 % lie in:"
-                " it is in every interval in kPa, and in no ratio; give a number if it was measured"
+                f"youngs_modulus_kpa = [{low:g}, {high:g}]  # a guess: the 95 % range about {value:g} kPa. It widens"
+                " every interval in kPa, and no ratio. Write one number here if you measured it"
             )
     return "\n".join(lines)
 

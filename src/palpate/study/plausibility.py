@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -13,6 +13,9 @@ from palpate.findings import Finding
 from palpate.images.tissue import Role
 from palpate.study.case import Case
 from palpate.study.estimated import Estimation
+from palpate.study.poisson_ratios import NOT_IDENTIFIED
+from palpate.study.tissue_names import found_word
+from palpate.uncertainty import NORMAL_95
 
 MARGIN = 3.0  # methods differ by ten to a hundred times: an estimate is doubtful only well outside what was published
 SOFT_TISSUE_KPA = (0.05, 1000.0)  # of a tissue without published values, with room on both sides
@@ -23,16 +26,18 @@ GIVEN_MARGIN = 10.0  # a modulus that is given lies outside what was published f
 class PublishedStiffness:
     """Young's modulus (kPa) of a tissue from `low` to `high`, how it was measured, and where it was published.
 
-    words: parts of a tissue's name that mean this tissue; unless: parts that mean another one all the same.
+    words: of a tissue's name that mean this tissue, between blanks; unless: words that mean another one all the same;
+    tumour: whether it is of a tumour, for names that say so alone.
     """
 
     tissue: str
-    words: Sequence[str]
+    words: str
     low: float
     high: float
     method: str
     source: str
-    unless: Sequence[str] = ()
+    unless: str = ""
+    tumour: bool = False
 
     @property
     def usual_kpa(self) -> float:
@@ -47,15 +52,17 @@ class PublishedStiffness:
 
 TABLE: dict[str, list[dict[str, Any]]] = tomllib.loads((files("palpate.study") / "tissues.toml").read_text("utf-8"))
 PUBLISHED = tuple(PublishedStiffness(**entry) for entry in TABLE["published"])
+TUMOURS = tuple(word for entry in TABLE["role"] if entry.get("tumour") for word in entry["words"].split())
 
 
 def published_for(name: str) -> tuple[PublishedStiffness, ...]:
-    """The published values whose words occur in a tissue's `name`, whatever its case, blanks and hyphens."""
-    plain = name.lower().replace(" ", "_").replace("-", "_")
-    named = [entry for entry in PUBLISHED if any(word in plain for word in entry.words)]
-    found = [entry for entry in named if not any(word in plain for word in entry.unless)]
-    tumours = [entry for entry in found if entry.tissue == "prostate cancer"]
-    return tuple(tumours or found)
+    """The published values whose words occur in a tissue's `name`, however it is spelled.
+
+    A tumour has those of tumours of its organ alone, none where the name does not tell the organ.
+    """
+    tumour = bool(found_word(name, TUMOURS))
+    named = [entry for entry in PUBLISHED if entry.tumour is tumour and found_word(name, entry.words.split())]
+    return tuple(entry for entry in named if not found_word(name, entry.unless.split()))
 
 
 def usual_stiffness(name: str) -> PublishedStiffness | None:
@@ -70,26 +77,39 @@ def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Finding, ...
     """
     found = []
     for name, value in moduli_kpa.items():
-        walls = "wall" in name.lower()
+        walls = bool(found_word(name, ("wall",)))
         entries = [entry for entry in published_for(name) if walls or not entry.tissue.endswith("wall")]
         low, high = min((e.low for e in entries), default=0.0), max((e.high for e in entries), default=math.inf)
         if low / MARGIN <= value <= high * MARGIN:
             continue
         closest = min(entries, key=lambda entry: min(abs(value - entry.low), abs(value - entry.high)))
         text = (
-            f"{name}: {value:.3g} kPa lies more than {MARGIN:g} times outside the published range for {closest.tissue}"
-            f" ({low:g} to {high:g} kPa; nearest: {closest.reference}). Check the `known` tissue's"
-            " modulus, the labels and the boundary before you believe it"
+            f"{name}: {value:.3g} kPa lies more than {MARGIN:g} times outside the published"
+            f" range for {closest.tissue}, {low:g} to {high:g} kPa ({closest.reference})."
+            " Check the modulus of the `known` tissue, the labels and the boundary"
         )
         found.append(Finding("implausible-stiffness", text))
     return tuple(found)
 
 
-def estimate_warnings(estimation: Estimation) -> tuple[Finding, ...]:
-    """`plausibility_warnings` on what was estimated; none where the search did not converge: they would tell moduli."""
-    if estimation.status != "converged":
+def estimate_warnings(case: Case, estimation: Estimation) -> tuple[Finding, ...]:
+    """`plausibility_warnings` on the moduli that a converged estimate states in kPa.
+
+    None where the images give their ratio only or less, and none where the scale in kPa is a guess.
+    """
+    if estimation.status != "converged" or _scale_is_guessed(case):
         return ()
-    return plausibility_warnings({e.tissue: e.value for e in estimation.estimates if e.value is not None})
+    stated = [e for e in estimation.estimates if e.verdict not in ("ratio only", NOT_IDENTIFIED)]
+    return plausibility_warnings({e.tissue: e.value for e in stated if e.value is not None})
+
+
+def _scale_is_guessed(case: Case) -> bool:
+    """Whether the range of the known modulus that sets the scale is too wide to judge a modulus by.
+
+    That is one whose ends differ by more than `MARGIN`, as the ends of those that `palpate init` fills in do.
+    """
+    known = [tissue.modulus_sd for tissue in case.tissues if tissue.role is Role.KNOWN]
+    return not case.known_force and 2.0 * NORMAL_95 * next(iter(known), 0.0) > math.log(MARGIN)
 
 
 def unit_warnings(case: Case) -> tuple[Finding, ...]:
@@ -105,12 +125,12 @@ def unit_warnings(case: Case) -> tuple[Finding, ...]:
         low, high = (low / GIVEN_MARGIN, high * GIVEN_MARGIN) if entries else SOFT_TISSUE_KPA
         if value and not low <= value <= high:
             unit, factor = ("Pa", 1e-3) if value > high else ("MPa", 1e3)
-            what = f"what was published of '{entries[0].tissue}', with room" if entries else "soft tissue"
+            what = f"'{entries[0].tissue}'" if entries else "soft tissue"
             hints.append(
                 Finding(
                     "units",
-                    f"tissue '{name}': youngs_modulus_kpa = {value:g} is unusual for {what} ({low:g} to {high:g}"
-                    f" kPa); if you meant {value:g} {unit}, write {value * factor:g}",
+                    f"tissue '{name}': youngs_modulus_kpa = {value:g} is unusual for {what}, which has {low:g} to"
+                    f" {high:g} kPa with room for methods. If you meant {value:g} {unit}, write {value * factor:g}",
                 )
             )
     return tuple(hints)

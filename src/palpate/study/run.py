@@ -124,7 +124,7 @@ def estimate_states(
         (
             *_remarks(case, *bodies),
             *strain_warnings(case, bodies, estimation),
-            *estimate_warnings(estimation),
+            *estimate_warnings(case, estimation),
         ),
         further=_further(bodies, estimation),
         alignments=states.alignments,

@@ -142,12 +142,30 @@ class _Place:
 
 def _check_complete(fields: Iterable[dataclasses.Field[Any]], table: Mapping[str, object], where: str) -> None:
     for field in fields:
-        needed = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        if needed and field.name not in table:
-            raise ConfigurationError(f"the key '{field.name}' is missing in {where}; it has no default")
+        if _needed(field) and field.name not in table:
+            raise ConfigurationError(f"the key '{field.name}' is missing in {where}; {_what_to_write(field)}")
         other = field.metadata.get("rule", Rule()).instead_of
         if other and field.name in table and other in table:
             raise ConfigurationError(f"'{field.name}' and '{other}' in {where} say the same thing; give one of them")
+
+
+def _needed(field: dataclasses.Field[Any]) -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+
+
+def _what_to_write(field: dataclasses.Field[Any]) -> str:
+    choices = field.metadata.get("rule", Rule()).choices
+    return "it has no default" + (f": write one of {', '.join(choices)}" if choices else "")
+
+
+def _check_each_complete(kind: Any, tables: Mapping[str, Mapping[str, object]], places: Mapping[str, _Place]) -> None:
+    """Name all tables of a kind that lack the same key, where several do."""
+    for field in dataclasses.fields(kind):
+        lacking = [places[name].table for name, table in tables.items() if field.name not in table]
+        if _needed(field) and field.name != "name" and len(lacking) > 1:
+            raise ConfigurationError(
+                f"the key '{field.name}' is missing in {', '.join(lacking)}; {_what_to_write(field)}"
+            )
 
 
 def _check_range(bounds: Rule, value: object, place: _Place) -> None:
@@ -210,6 +228,7 @@ def _convert_tuple(arms: tuple[Any, ...], value: object, place: _Place) -> objec
         for name, table in tables.items():
             if "name" in table:
                 raise ConfigurationError(f"unknown key 'name' in {places[name].table}: the table's own name is it")
+        _check_each_complete(kind, tables, places)
         return tuple(_convert_table(kind, {**table, "name": name}, places[name]) for name, table in tables.items())
     items = _expect(value, list, "a list in square brackets", place=place)
     if arms[-1] is not Ellipsis and len(items) != len(arms):
