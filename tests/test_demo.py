@@ -23,7 +23,7 @@ BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", STEPS, flags=re.DOTALL | re.MULTIL
 TYPED = [line for kind, block in BLOCKS if not kind for line in block.splitlines()]
 (MASKS,) = (block for kind, block in BLOCKS if kind == "python")
 SHOWN = [block for kind, block in BLOCKS if kind == "text"]
-MACHINE = re.compile(r"[\d.]+ GB, [\d.]+ (?:s|min) .*")  # time and memory, which are the machine's
+MACHINE = re.compile(r"(?<=expected: ).* of memory|\S+ on \d+ processors?\)")  # time and memory are the machine's
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 WORDS_A_MINUTE = 200
 KEYS_A_MINUTE = 200

@@ -123,6 +123,7 @@ class CheckReport:
                 "seconds": round(cost.seconds),
                 "solver": cost.solver,
                 "processors": cost.processors,
+                "meshed": cost.between is None,
             },
             "predicted": self.predicted and self.predicted.to_dict(),
         }
@@ -141,11 +142,7 @@ class CheckReport:
             lines.append(f"alignment: '{name}' {found.in_words} (surfaces then lie apart by, in mm: {kept})")
         lines += [f"{name}: {words}" for name, words in self.measured.items()]
         if self.cost is not None:
-            cost = self.cost
-            lines.append(
-                f"expected: {cost.tets} tetrahedra, {cost.unknowns} unknowns, {cost.memory_gb:.1f} GB,"
-                f" {cost.seconds / 60.0:.1f} min with {cost.solver} on {cost.processors} processor(s)"
-            )
+            lines.append(f"expected: {self.cost.in_words}")
         if self.predicted is not None:
             lines += self.predicted.lines()
         return "\n".join(lines)
@@ -272,6 +269,7 @@ def _cost(
     """
     first = pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs), mesh=first.mesh)
+    progress(f"expected: {cost.in_words}")
     if problems.refused or not meshed or lack_of_memory(cost):
         problems.found += memory_problems(cost)
         return cost, ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import ndimage
@@ -18,23 +18,24 @@ from palpate.mechanics.solvers.registry import expected_of_size
 from palpate.mesh import SizeField, TetMesh
 from palpate.parallel import processors
 from palpate.processes import available_memory, total_memory
-from palpate.progress import STAGES, Stage
+from palpate.progress import STAGES, Stage, about
 from palpate.study.case import Case
 from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of
 
 MEMORY_FACTOR = 1.5  # how far the predicted memory may be off
 
 LATTICE = 64  # points of the lattice along the longest side, on which edge lengths are summed
-# Fitted to runs of benchmarks/cost.py (docs/command-line.md), between machines that take 110 and 160 s for the demo.
-TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
+# Fitted to stages of the demo on a machine of two cores that takes 80 s for it; slow machines take twice as long.
+TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length, before the mesh is made
+TETS_BETWEEN = (17.0, 31.0)  # the same of smooth phantoms and of a real pelvis: what a guess allows for
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
 FIXED_S: Mapping[Stage, float] = {"reading": 5.0, "linear law": 4.0, "intervals": 5.0, "report": 8.0}
-SECONDS_AN_UNKNOWN = 4.6e-4  # beside the solver, with 90 modes a driver, for each later image
-FINITE_STRAIN_S = 4.2e-4  # the same of equilibria and their derivatives at finite strain
-INTERVALS_S = 4.6e-4  # the same of intervals, and of what would change the answer
+SECONDS_AN_UNKNOWN = 2.4e-4  # beside the solver, with 90 modes a driver, for each later image
+FINITE_STRAIN_S = 3.6e-4  # the same of equilibria and their derivatives at finite strain
+INTERVALS_S = 2.2e-4  # the same of intervals, and of what would change the answer
 FROM_REST = 2  # further passes, each with a linear one, where the state without loads is found with the moduli
 SECONDS_A_DRAW = 0.039  # of the posterior, in four chains, with 90 modes, for each later image
-SECONDS_A_CUT = 2.0e-4  # of meshing, for each tetrahedron and each tissue that is cut out
+SECONDS_A_CUT = 1.0e-4  # of meshing, for each tetrahedron and each tissue that is cut out
 PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
 FIXED_GB = 0.48
 GB_AN_UNKNOWN = 1.7e-5  # beside the factor, with 90 modes
@@ -50,7 +51,8 @@ SERIES = 30  # right-hand sides beside the modes
 class ExpectedCost:
     """Size of the mesh and of the linear systems, peak memory (GB), time (s), and what they were predicted for.
 
-    stages: of the time, what each stage takes (s), in their order.
+    stages: of the time, what each stage takes (s), in their order; between: the costs of the smallest and of the
+    largest mesh that the images may lead to, None where the mesh is known.
     """
 
     tets: int
@@ -60,6 +62,29 @@ class ExpectedCost:
     solver: str
     processors: int
     stages: Mapping[Stage, float] = field(default_factory=dict)
+    between: tuple[ExpectedCost, ExpectedCost] | None = None
+
+    @property
+    def time_words(self) -> str:
+        """The time in words: "about 2 minutes", before the mesh is known a range."""
+        least, most = (about(each.seconds) for each in self.between or (self, self))
+        return f"about {least}" if least == most else f"{least} to {most}"
+
+    @property
+    def memory_words(self) -> str:
+        """The peak memory in words: "2.2 GB", before the mesh is known a range."""
+        least, most = (f"{each.memory_gb:.1f}" for each in self.between or (self, self))
+        return f"{least} GB" if least == most else f"{least} to {most} GB"
+
+    @property
+    def in_words(self) -> str:
+        """Time, memory and size in words, as every command tells them."""
+        least, most = (str(each.unknowns) for each in self.between or (self, self))
+        unknowns = f"{self.tets} tetrahedra, {most} unknowns" if least == most else f"{least} to {most} unknowns"
+        return (
+            f"{self.time_words}, {self.memory_words} of memory ({unknowns}, {self.solver} on"
+            f" {self.processors} processor{'s' * (self.processors != 1)})"
+        )
 
 
 def expected_cost(
@@ -68,10 +93,19 @@ def expected_cost(
     """The cost of estimating a case on this machine, from its first pair of images; further pairs cost the same each.
 
     Nothing is meshed: tetrahedra from the sum of 1 / h^3 over the meshed volume, h the mesher's own edge length there,
-    or those of the case's own `mesh`.
+    or those of the case's own `mesh`. Every command that predicts a cost before it meshes has it from here.
     """
-    size = expected_size(case, expected_tets(case, before, after) if mesh is None else len(mesh.tets))
-    return cost_of_meshes(case, before, [size] * n_pairs, n_after=len(after) or case.n_states)
+
+    def of(tets: float) -> ExpectedCost:
+        """On a mesh of so many tetrahedra a pair."""
+        sizes = [expected_size(case, int(tets))] * n_pairs
+        return cost_of_meshes(case, before, sizes, n_after=len(after) or case.n_states)
+
+    if mesh is not None:
+        return of(len(mesh.tets))
+    tets = expected_tets(case, before, after)
+    least, most = (of(tets * each / TETS_A_CUBE) for each in TETS_BETWEEN)
+    return replace(of(tets), between=(least, most))
 
 
 def expected_size(case: Case, tets: int) -> tuple[int, int]:

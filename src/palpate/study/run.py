@@ -15,7 +15,7 @@ from palpate.inversion import Bounds, Inversion, InversionSettings
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
-from palpate.progress import Forecast, Progress, about, during, silent
+from palpate.progress import Forecast, Progress, during, silent
 from palpate.study.body import Body, cost_of_bodies, joint_problem, make_body
 from palpate.study.case import SOUGHT_RATIOS, Case, Mechanics
 from palpate.study.case_body import LAW_NAMES
@@ -172,8 +172,7 @@ def _what_would_change(
 
 
 def _forecast(cost: ExpectedCost) -> Forecast:
-    words = f"about {about(cost.seconds)}, as predicted for {cost.unknowns} unknowns on {cost.processors} processor(s)"
-    return Forecast(words, cost.stages)
+    return Forecast(f"expected: {cost.in_words}", cost.stages)
 
 
 def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSettings:
