@@ -1,6 +1,6 @@
-"""The stiffness of two balls, one in the other, from one label image before and one after a frame has squeezed them.
+"""Find the stiffness of two balls, one inside the other, from label images before and after a frame squeezes them.
 
-The images are made here, from a phantom of 60 and 30 kPa; with images of your own, start at `read_case`.
+The images are simulated, with 60 and 30 kPa. With images of your own, start at `read_case`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from palpate.phantoms import SpheresOptions, spheres
 
 TRUTH_KPA = {"core": 60.0, "shell": 30.0}
 CASE = """
-mechanics.law = "linear"  # as this phantom; leave it out for real images
-discrepancy.layer_sd = 0.0  # nothing soft lies between these balls; leave it out where you do not know that
+mechanics.law = "linear"  # the simulation is linear; leave this out for real images
+discrepancy.layer_sd = 0.0  # no soft layer lies between these balls; leave this out unless you know that
 [images]
 before = "before.nii.gz"
 after = ["after.nii.gz"]
@@ -35,7 +35,7 @@ start_ratios = [1.0, 4.0]
 
 
 def write_case(folder: Path) -> Path:
-    """Write both label images (1 mm voxels) and the case that names them."""
+    """Write both label images (voxels of 1 mm) and the case that names them."""
     scene = spheres(SpheresOptions(seed=2, spacing_mm=(1.0, 1.0, 1.0), truth_edge_mm=4.0))
     write_label_image(folder / "before.nii.gz", scene.before)
     write_label_image(folder / "after.nii.gz", scene.after)
@@ -44,12 +44,12 @@ def write_case(folder: Path) -> Path:
 
 
 def main() -> float:
-    """Estimate, print what was found, and give the core's Young's modulus (kPa)."""
+    """Estimate, print the result, and return the core's Young's modulus (kPa)."""
     with tempfile.TemporaryDirectory() as folder:
         result = palpate.estimate(palpate.read_case(write_case(Path(folder))))
     sys.stdout.write(f"{result}\n")
     for e in result.estimation.estimates:
-        low, high = e.interval95  # None where it is not identified
+        low, high = e.interval95  # None if it is not identified
         assert low < TRUTH_KPA[e.tissue] < high
     return result.estimation.estimates[0].value
 

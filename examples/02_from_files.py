@@ -1,7 +1,7 @@
-"""From label images on disk to a mesh: what the files and the case look like, and how good the mesh is.
+"""Make a mesh from label images on disk: this shows the files, the case, and the quality of the mesh.
 
-A ball, the organ, beside a hollow tube, the driver. The asserted number is the ball's volume in the mesh: voxels are
-2 mm wide, and smoothing them over 1.2 mm draws a surface of radius R inwards by about 1.2^2 / R mm, in both images.
+A ball, the organ, lies beside a hollow tube, the driver. The asserted number is the ball's volume in the mesh over its
+true volume. Voxels are 2 mm wide, and smoothing over 1.2 mm shrinks a radius R by about 1.2^2 / R mm, in both images.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ edge_length_mm = 6.0
 
 
 def write_case(folder: Path) -> Path:
-    """Both images and the case; in the later state the tube is 2 mm wider, the organ 2 mm further away."""
+    """Write both images and the case; in the later state the tube is 2 mm wider, and the organ 2 mm further away."""
     grid = VoxelGrid((40, 44, 36), np.diag([VOXEL, VOXEL, VOXEL, 1.0]))
     at = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), -1) * VOXEL
     for name, more in (("before", 0.0), ("after", 2.0)):
@@ -41,7 +41,7 @@ def write_case(folder: Path) -> Path:
 
 
 def main() -> float:
-    """Mesh the reference state; the organ's volume in the mesh by that of the ball (dimensionless)."""
+    """Mesh the reference state, and return the organ's volume in the mesh over that of the ball."""
     with tempfile.TemporaryDirectory() as folder:
         tets = make_mesh(read_case(write_case(Path(folder)))).space.mesh
     corners = tets.nodes[tets.tets[tets.region == 0]]

@@ -1,6 +1,7 @@
 """Why a case needs a tissue of known stiffness: displacements fix the ratios of moduli, never their scale.
 
-K(E) is linear in the moduli and no force is prescribed, so K(5 E) u = 5 K(E) u = 0 has the same solution u.
+The stiffness matrix K(E) is linear in the moduli, and no force is prescribed. So K(5 E) u = 5 K(E) u = 0 has the same
+solution u as K(E) u = 0.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def displacement(moduli: list[float]) -> np.ndarray:
 
 
 def main() -> float:
-    """Largest change (mm) of the displacement when every modulus is multiplied by five."""
+    """Return the largest change (mm) of the displacement if every modulus is multiplied by five."""
     first = displacement([30.0, 10.0])
     scaled = float(np.abs(displacement([150.0, 50.0]) - first).max())
     other = float(np.abs(displacement([60.0, 10.0]) - first).max())

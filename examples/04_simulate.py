@@ -1,7 +1,8 @@
-"""A later state made to order: fill a tube by 3 mm beside an organ of known stiffness, and image the result.
+"""Simulate a later state: fill a tube by 3 mm beside an organ of known stiffness, and make its label image.
 
-`[motion]` replaces the driver's motion that the later image would show. The wall moves by 3 mm where the tube is
-fullest, in proportion to its distance from the middle line: the asserted number is the largest displacement.
+`[motion]` replaces the motion of the driver that a later image would show. Where the tube fills most, its wall moves by
+3 mm at the mean radius, and in proportion to the distance from the middle line. The asserted number is the largest
+displacement.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ edge_length_mm = 8.0
 
 
 def write_case(folder: Path) -> Path:
-    """A ball of 14 mm, 5 mm from a tube of 8 mm that runs through the image; voxels of 2 mm."""
+    """Write a ball of 14 mm radius, 5 mm from a tube of 8 mm radius that runs through the image; voxels of 2 mm."""
     grid = VoxelGrid((40, 44, 36), np.diag([2.0, 2.0, 2.0, 1.0]))
     at = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), -1) * 2.0
     for name, shift in (("before", 0.0), ("shifted", 2.0)):
@@ -41,7 +42,7 @@ def write_case(folder: Path) -> Path:
 
 
 def main() -> float:
-    """Largest displacement (mm)."""
+    """Simulate, and return the largest displacement (mm)."""
     with tempfile.TemporaryDirectory() as folder:
         result = simulate(read_case(write_case(Path(folder))))
     largest = float(np.linalg.norm(result.displacements[-1], axis=1).max())

@@ -1,6 +1,6 @@
-"""How stiff is a ball in a gel? Sixty markers are seen before and after the top of a block of gel is pushed down.
+"""How stiff is a ball in a gel? Sixty markers are seen before and after the top of the gel is pushed down.
 
-No image is needed: the block comes as a mesh. The measurements are simulated, on a finer mesh than the estimate's.
+No image is needed, as the block is given as a mesh. The markers are simulated on a finer mesh than the estimate's.
 """
 
 import sys
@@ -42,7 +42,7 @@ def markers() -> np.ndarray:
 
 
 def main() -> float:
-    """Write the case, estimate, print what is found, and give the ball's modulus (kPa)."""
+    """Write the case, estimate, print the result, and return the ball's modulus (kPa)."""
     with tempfile.TemporaryDirectory() as name:
         folder, mesh = Path(name), tetrahedralise(BODY, edge_length_mm=6.0)
         data = {"tissue": [mesh.region + 1]}

@@ -1,6 +1,6 @@
-"""Young's modulus of a block under a press, in kPa: from a mesh, a table of displacements and the measured force.
+"""Find the Young's modulus (kPa) of a block under a press, from a mesh, a table of displacements and the force.
 
-Displacements as digital volume correlation gives them, simulated here on a finer mesh. The force sets the scale.
+The displacements are simulated on a finer mesh, as digital volume correlation gives them. The force sets the scale.
 """
 
 import sys
@@ -43,7 +43,7 @@ def field(rng: np.random.Generator) -> np.ndarray:
 
 
 def main() -> float:
-    """Write the case, estimate, print what is found, and give the block's modulus (kPa)."""
+    """Write the case, estimate, print the result, and return the block's modulus (kPa)."""
     with tempfile.TemporaryDirectory() as name:
         folder, mesh = Path(name), tetrahedralise(BODY, edge_length_mm=1.5)
         meshio.write(folder / "block.vtu", meshio.Mesh(mesh.nodes, [("tetra", mesh.tets)]))

@@ -1,6 +1,6 @@
-"""Fat and gland of a breast from one image of a prone patient and one of a supine one: gravity is the known load.
+"""Find the moduli of fat and gland in a breast from a prone and a supine image: gravity is the known load.
 
-The images are simulated, on a finer mesh. At the strains of a real breast leave the law out, and give the run minutes.
+The images are simulated on a finer mesh. For a real breast leave the law out; the run then takes minutes.
 """
 
 import sys
@@ -14,7 +14,7 @@ from palpate.images import LabelImage, VoxelGrid, write_label_image
 
 CASE = """
 images = { before = "prone.nii.gz"AFTER }
-domain.outer_boundary = "fixed"  # the images are cut in the chest's wall, which does not move
+domain.outer_boundary = "fixed"  # the images end in the chest's wall, which does not move
 mechanics.law = "linear"
 mesh.edge_length_mm = EDGE
 estimate = { starts_kpa = [6.0], bounds_kpa = [0.2, 100.0] }
@@ -35,7 +35,7 @@ acceleration_m_s2 = [0.0, -9.81, 0.0]  # supine
 
 
 def main() -> float:
-    """Simulate both images, estimate, print what is found, and give the modulus of the gland (kPa)."""
+    """Simulate both images, estimate, print the result, and return the modulus of the gland (kPa)."""
     grid = VoxelGrid((50, 32, 50), np.diag([2.0, 2.0, 2.0, 1.0]))
     x, y, z = 2.0 * np.indices(grid.shape) - np.reshape([49.1, 9.3, 48.7], (3, 1, 1, 1))
     labels = np.where((x / 40) ** 2 + (y / 42) ** 2 + (z / 40) ** 2 < 1.0, 2, 0)

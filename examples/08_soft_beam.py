@@ -1,4 +1,4 @@
-"""Young's modulus of a soft beam: forty markers while it hangs from a clamp, and after the clamp is turned over."""
+"""Find the Young's modulus of a soft beam from forty markers, before and after its clamp is turned over."""
 
 import sys
 import tempfile
@@ -27,7 +27,7 @@ loads = [{ kind = "gravity", state = 0, acceleration_m_s2 = [0.0, 0.0, -9.81] },
 
 
 def write_beam(folder: Path) -> None:
-    """The hanging beam of 200 kPa as a coarse mesh, and forty markers in it; simulated on a finer mesh."""
+    """Write the hanging beam (200 kPa) as a coarse mesh, and forty markers in it; a finer mesh simulates both."""
     space = lagrange_space(tetrahedralise(BODY, edge_length_mm=0.9), "P2")
     none, held = np.zeros((space.points.size, 0)), space.points[:, 0] < 0.001
     clamp = outer_constraint(space, outer="free", modes=none, offset=none.sum(axis=1), prescribed=held)
@@ -44,7 +44,7 @@ def write_beam(folder: Path) -> None:
 
 
 def main() -> float:
-    """Write the case, estimate, print what is found, and give the modulus (kPa)."""
+    """Write the case, estimate, print the result, and return the modulus (kPa)."""
     with tempfile.TemporaryDirectory() as name:
         write_beam(Path(name))
         (Path(name) / "case.toml").write_text(CASE)
