@@ -45,6 +45,7 @@ class Run:
     fitted: bool = True
 
 
+GB_A_MEBIBYTE = 1024**2 / 1e9  # the unit of `palpate.study.cost`
 RUNS = (
     Run("spheres", 8.0, modes=30),
     Run("spheres", 6.0),
@@ -174,8 +175,8 @@ def _estimated(case: Case, guessed: ExpectedCost, predicted: ExpectedCost) -> di
         "unknowns": [guessed.unknowns, predicted.unknowns, result.mesh_summary.dofs],
         "tets": len(result.space.mesh.tets),
         "seconds": [round(predicted.seconds, 1), round(time.perf_counter() - began, 1)],
-        "memory_gb": [round(predicted.memory_gb, 2), round(peak_mb() / 1024.0, 2)],
-        "memory_of_check_gb": round(earlier / 1024.0, 2),
+        "memory_gb": [round(predicted.memory_gb, 2), round(peak_mb() * GB_A_MEBIBYTE, 2)],
+        "memory_of_check_gb": round(earlier * GB_A_MEBIBYTE, 2),
         "stages_s": dict(result.provenance.seconds),
         "status": result.estimation.status,
     }
