@@ -101,12 +101,22 @@ def demo(place: Place) -> Values:
     found = run([*PALPATE, "demo", "--output", folder, "--quiet"])
     document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
     table = [line for line in found.text.splitlines() if line][: 2 + len(document["estimates"])]
+    words = [*PALPATE, "check", folder / "case.toml", "--html", place.folder / "check.html", "--json", "--quiet"]
+    predicted = json.loads(run(words).text)["predicted"]["moduli"]
     return {
         "result": table,
         "seconds": round(found.seconds),
         "peak_gb": round(found.peak_gb, 1),
         "unknowns": spaced(document["mesh"]["dofs"]),
+        "predicted": {each["tissue"]: to_each_side(each["interval95"]) for each in predicted},
+        "found": {each["tissue"]: to_each_side(each["interval95"]) for each in document["estimates"]},
     }
+
+
+def to_each_side(ends: Sequence[float]) -> float:
+    """The factor by which an interval reaches from its middle in ln E to either end."""
+    low, high = ends
+    return round(float(np.sqrt(high / low)), 2)
 
 
 def tutorial(place: Place) -> Values:
@@ -133,6 +143,20 @@ def examples(place: Place) -> Values:
     """What those examples print whose output pages show."""
     del place
     return {name: run([sys.executable, f"examples/{script}.py"]).text.splitlines() for name, script in EXAMPLES.items()}
+
+
+def inputs(place: Place) -> Values:
+    """The demo's labels in four formats."""
+    del place
+    found = json.loads(run([sys.executable, *shlex.split(PARTS["inputs"].command)[1:], "--json"]).text)
+    rows = {"demo": found["demo"]} | {row["input"]: row["estimates"] for row in found["inputs"]}
+    return {name: of_prostate(estimates["prostate"]) for name, estimates in rows.items()}
+
+
+def of_prostate(estimate: Values) -> str:
+    """Value and interval in words."""
+    low, high = estimate["interval"]
+    return f"{estimate['value']:.3g} kPa ({low:.3g} to {high:.3g})"
 
 
 def accuracy(place: Place) -> Values:
@@ -195,12 +219,25 @@ def mismatch_of(results: Sequence[Values]) -> Values:
         held, stated = (sum(row[name] for row in rows.values()) for name in ("held", "stated"))
         verdicts = [sum(row["verdicts"][k] for row in rows.values()) for k in range(len(VERDICTS))]
         found[kind] = {"commit": ", ".join(sorted(commits)), "rows": rows, "held": held, "stated": stated}
+        if kind == "linear":
+            found[kind] |= {
+                "border": worst(results, ("border",), "linear"),
+                "patchy": worst(results, ("halves", "field", "field-organs"), "linear"),
+                "sheath": worst(results, ("sheath",), "linear"),
+            }
         if kind == "noise":
             found[kind] |= {"pairs": sum(row["bodies"] for row in rows.values()), "moduli": sum(verdicts)}
             found[kind] |= {"open": verdicts[-1]}
         else:
             found[kind] |= {"share": share(held, stated)}
     return found
+
+
+def worst(results: Sequence[Values], scenes: Sequence[str], law: str) -> int:
+    """The largest error of a modulus in these scenes without noise, per cent of the truth."""
+    own = [r for r in results if r["scene"] in scenes and r["law"] == law and not r["noise_mm"] and not r["set"]]
+    errors = [abs(np.expm1(each["ln_error"])) for result in own for each in result["estimates"]]
+    return round(100.0 * float(max(errors)))
 
 
 def scene_of(cases: Sequence[Values], *, with_width: bool) -> Values:
@@ -370,6 +407,7 @@ PARTS = {
     "demo": Part("palpate demo", 1.5, demo),
     "tutorial": Part("palpate init, check, estimate", 2.5, tutorial),
     "examples": Part("python examples/NAME.py", 3, examples),
+    "inputs": Part("python benchmarks/inputs.py", 6, inputs),
     "accuracy": Part("python benchmarks/accuracy.py --cases 2 --first-seed 601", 20, accuracy),
     "mismatch": Part("python benchmarks/mismatch.py --bodies 2 --first-seed 701", 35, mismatch),
     "coverage": Part("python benchmarks/coverage.py --bodies 1 --draws 4 --first-seed 501", 35, coverage),
