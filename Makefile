@@ -75,10 +75,11 @@ $(AXE):
 	cd build/axe && npm pack --silent axe-core@4 && tar xzf axe-core-*.tgz
 
 # Every figure that README and docs state, and their pictures, into docs/figures.json and the pages: about two hours on
-# two quiet cores. PARTS="demo examples" runs some parts alone, PARTS=text none: it writes what the file says.
+# two quiet cores. PARTS="demo examples" runs some parts alone, PARTS=text none: it writes what the file says. BODIES=6
+# takes more bodies for accuracy, mismatch and coverage, and as many times as long.
 figures: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[browser]"
-	$(BIN)/python benchmarks/figures.py $(PARTS) $(if $(BROWSER),--browser $(BROWSER))
+	$(BIN)/python benchmarks/figures.py $(PARTS) $(if $(BODIES),--bodies $(BODIES)) $(if $(BROWSER),--browser $(BROWSER))
 
 # case.schema.json, which the package ships, from the dataclasses that read a case.
 schemas: install

@@ -1,6 +1,6 @@
 """Every figure that README and docs state of this program: `make figures`.
 
-    python benchmarks/figures.py [PART ...] [--processes N] [--browser CHROMIUM]
+    python benchmarks/figures.py [PART ...] [--bodies N] [--processes N] [--browser CHROMIUM]
     python benchmarks/figures.py text      # no run: what the file says into the pages
 
 Runs the parts (figures_parts.py: all but those that take hours, which must be named), one after the other, about two
@@ -33,6 +33,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; or {TEXT} alone")
     parser.add_argument("--processes", type=int, default=processors(), help="that share a campaign")
+    parser.add_argument("--bodies", type=int, help="of accuracy, mismatch and coverage, instead of few")
     parser.add_argument("--browser", help="a Chromium, for the pictures")
     asked = parser.parse_args()
     if unknown := set(asked.parts) - {*PARTS, TEXT}:
@@ -43,17 +44,17 @@ def main() -> int:
     commit = commit_of_code()
     folder = ROOT / "build" / "figures" / commit  # a run that was interrupted goes on there
     folder.mkdir(parents=True, exist_ok=True)
-    place = Place(folder, asked.processes, asked.browser)
+    place = Place(folder, asked.processes, asked.browser, asked.bodies)
     for name in names:
         part = PARTS[name]
-        say(f"{name}: {part.command} (about {part.minutes:g} minutes on two quiet cores)")
+        say(f"{name}: {place.command(name)} (about {part.minutes:g} minutes on two quiet cores, at the usual size)")
         if (load := os.getloadavg()[0]) > BUSY:
             say(f"other programs keep {load:.1f} processors busy: times that are measured now are too long")
         began = time.perf_counter()
         values = part.values(place)
         figures = read_figures() if FILE.exists() else {}
         figures[name] = {
-            "command": part.command,
+            "command": place.command(name),
             "commit": commit,
             "machine": machine(),
             "minutes": round((time.perf_counter() - began) / 60.0, 1),

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,11 +30,20 @@ VERDICTS = (*STATED, "not identified")
 
 
 class Place(NamedTuple):
-    """Where parts run: a folder that they share, how many processes at once, and a Chromium."""
+    """Where parts run: a folder that they share, how many processes at once, and a Chromium.
+
+    bodies: how many bodies campaigns have, None: as many as `PARTS` says.
+    """
 
     folder: Path
     processes: int
     browser: str | None = None
+    bodies: int | None = None
+
+    def command(self, name: str) -> str:
+        """The command of a part, with that number of bodies."""
+        stated = PARTS[name].command
+        return stated if self.bodies is None else re.sub(r"(--bodies|--cases) \d+", rf"\1 {self.bodies}", stated)
 
 
 class Run(NamedTuple):
@@ -73,10 +83,12 @@ def run(command: Sequence[str | Path], *, folder: Path = ROOT) -> Run:
 def shared(command: str, place: Place) -> None:
     """Run a script of benchmarks/ whose bodies several processes take in turns, each on one thread."""
     words = [sys.executable, *shlex.split(command)[1:]]
+    bodies = next(int(count) for name, count in pairwise(words) if name in ("--bodies", "--cases"))
+    processes = min(place.processes, bodies)  # one without a body has nothing to tell
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     running = [
-        subprocess.Popen([*words, "--share", f"{k}/{place.processes}"], cwd=ROOT, env=environment, stdout=sys.stderr)
-        for k in range(place.processes)
+        subprocess.Popen([*words, "--share", f"{k}/{processes}"], cwd=ROOT, env=environment, stdout=sys.stderr)
+        for k in range(processes)
     ]
     failed = [process.args for process in running if process.wait()]
     if failed:
@@ -161,7 +173,7 @@ def of_prostate(estimate: Values) -> str:
 
 def accuracy(place: Place) -> Values:
     """The rows of benchmarks/accuracy.py."""
-    shared(f"{PARTS['accuracy'].command} --output {place.folder / 'accuracy.jsonl'}", place)
+    shared(f"{place.command('accuracy')} --output {place.folder / 'accuracy.jsonl'}", place)
     return accuracy_of(lines_of(kept(place, "accuracy")))
 
 
@@ -189,7 +201,7 @@ def mismatch(place: Place) -> Values:
     """The scenes of benchmarks/mismatch.py: without noise under both laws, and with 0.3 mm of it."""
     file = f"--scenes-cache {place.folder / 'scenes'} --output {place.folder / 'mismatch.jsonl'}"
     scenes = "--scenes " + ",".join(SCENES)
-    script = f"{PARTS['mismatch'].command} {file}"
+    script = f"{place.command('mismatch')} {file}"
     shared(f"{script} {scenes} --laws linear --noise clean", place)
     shared(f"{script} --scenes {','.join(FINITE)} --laws neo-hookean --noise clean", place)
     shared(f"{script} --scenes {','.join(NOISY)} --noise 0.3", place)
@@ -221,6 +233,7 @@ def mismatch_of(results: Sequence[Values]) -> Values:
         found[kind] = {"commit": ", ".join(sorted(commits)), "rows": rows, "held": held, "stated": stated}
         if kind == "linear":
             found[kind] |= {
+                "uncertain": round(100.0 / float(np.sqrt(2.0 * min(row["bodies"] for row in rows.values())))),
                 "border": worst(results, ("border",), "linear"),
                 "patchy": worst(results, ("halves", "field", "field-organs"), "linear"),
                 "sheath": worst(results, ("sheath",), "linear"),
@@ -257,7 +270,7 @@ def scene_of(cases: Sequence[Values], *, with_width: bool) -> Values:
 
 def coverage(place: Place) -> Values:
     """The rows of benchmarks/coverage.py."""
-    words = shlex.split(PARTS["coverage"].command)[1:]
+    words = shlex.split(place.command("coverage"))[1:]
     run([sys.executable, *words, "--output", place.folder / "coverage.jsonl"])
     return coverage_of(lines_of(kept(place, "coverage")))
 
