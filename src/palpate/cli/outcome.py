@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 
 GAP = "  "  # between columns
+PAGES = ("report.html", "sensitivity.html")  # of which the first that was written is to be looked at
 MOST_LETTERS, LEAST_LETTERS = 100, 20  # of a line in a terminal; of a column that is broken
 
 
@@ -70,10 +71,11 @@ def estimates_table(document: Mapping[str, Any]) -> str:
 
 
 def listed(outputs: OutputFolder) -> str:
-    """Where the files are that the run has written, and which; those of a sub-folder by its name."""
+    """Where the files are that the run has written, and which; those of a sub-folder by its name; which one to open."""
     names = dict.fromkeys(name.split("/")[0] + ("/" if "/" in name else "") for name in outputs.written)
     log = ["log.txt"] if log_is_open() else []
-    return f"written to {outputs.path}: {', '.join([*names, *log])}"
+    page = next((f"\nopen {outputs.path / name}" for name in PAGES if name in outputs.written), "")
+    return f"written to {outputs.path}: {', '.join([*names, *log])}{page}"
 
 
 def columns(rows: Sequence[Sequence[str]]) -> str:
@@ -89,11 +91,6 @@ def columns(rows: Sequence[Sequence[str]]) -> str:
         cells = zip_longest(*(parts or [""] for parts in broken), fillvalue="")
         lines += [GAP.join(map(str.ljust, parts, widths)).rstrip() for parts in cells]
     return "\n".join(lines)
-
-
-def warning_lines(document: Mapping[str, Any]) -> str:
-    """The document's warnings, a line each with its code; docs/warnings.md tells of all codes."""
-    return "".join(f"warning ({warning['code']}): {warning['message']}\n" for warning in document["warnings"])
 
 
 def printable_lines(text: str) -> str:

@@ -28,7 +28,7 @@ EXAMPLES = {
         "palpate init masks_before/ masks_after/ --output case",
     ),
     "check": (
-        "palpate check case/case.toml --html preview.html",
+        "palpate check case/case.toml --html",
         "palpate check case/case.toml --set mesh.edge_length_mm=6 --json",
     ),
     "noise": (
@@ -99,6 +99,8 @@ class _Parser(argparse.ArgumentParser):
         if mistyped:
             names = re.findall(r"[\w-]+", mistyped[2])
             message = f"there is no command {shown(mistyped[1])}: {nearest(mistyped[1], names)}"
+        if message.endswith("required: CASE.TOML"):  # an option took it
+            message += "; give it before the options"
         super().error(message)
 
 
@@ -118,8 +120,9 @@ def make_parser() -> argparse.ArgumentParser:
         help="print what makes the shell complete commands, flags and files: source it at the shell's start",
     )
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
-    what = "the whole way on the pelvis that Palpate brings along"
+    what = "estimate the example that is installed with Palpate, a pelvis: from images to report"
     demo = _command(subparsers, "demo", written.demo, what=what, folder="palpate-demo")
+    _add_overwrite(demo)
     demo.set_defaults(targets=written.TARGETS)
     _add_preparations(subparsers)
     _add_estimates(subparsers)
@@ -143,8 +146,8 @@ def _add_preparations(subparsers: Any) -> None:
     what = "list every problem of a case without computing"
     check = _command(subparsers, "check", commands.check, what=what, folder=None)
     check.add_argument("case_file", type=Path, metavar="CASE.TOML", help=CASE_HELP)
-    what = "write a page that shows who is who, how the images lie, what is held, and the intervals to expect"
-    check.add_argument("--html", type=Path, metavar="FILE", help=what)
+    what = "write a page with roles, images, boundary and expected intervals; default: preview.html beside the case"
+    check.add_argument("--html", type=Path, nargs="?", const=commands.BESIDE, metavar="FILE", help=what)
     _add_set(check)
     what = "tell how well surfaces are drawn, from two segmentations of one state: [noise] and [discrepancy] of a case"
     noise = _command(subparsers, "noise", commands.noise, what=what, folder=None)
@@ -191,6 +194,7 @@ def _add_estimates(subparsers: Any) -> None:
     _add_ct(estimate)
     what = "first write preview.html, which shows what will be estimated; costs another mesh"
     estimate.add_argument("--preview", action="store_true", help=what)
+    _add_overwrite(estimate)
     estimate.set_defaults(targets=written.TARGETS)
     _add_set(estimate)
     what = "keep N draws of the moduli's posterior in each of 4 chains, as posterior.nc (extra `samples`)"
@@ -235,6 +239,8 @@ def _add_cohort(subparsers: Any) -> None:
     command.add_argument("--workers", type=_count, metavar="N", help="cases at a time; default: one a processor")
     command.add_argument("--resume", action="store_true", help="go on with the cohort in the output folder")
     command.add_argument("--only-failed", action="store_true", help="of that cohort, compute the failed rows again")
+    what = "compute all rows again, in a folder that has a cohort already, this one or another"
+    command.add_argument("--overwrite", action="store_true", help=what)
     command.add_argument(
         "--memory-limit", type=_positive, metavar="GB", help="of each case; default: by its prediction"
     )
@@ -255,6 +261,11 @@ def _add_cohort(subparsers: Any) -> None:
 def _add_ct(command: argparse.ArgumentParser) -> None:
     what = "CT of before, or of each image: for the report, and to tell air from tissue in label 0"
     command.add_argument("--ct", type=Path, nargs="+", default=[], metavar="CT", help=what)
+
+
+def _add_overwrite(command: argparse.ArgumentParser) -> None:
+    what = "replace the result of another case in the output folder"
+    command.add_argument("--overwrite", action="store_true", help=what)
 
 
 def _add_case(command: argparse.ArgumentParser) -> None:
@@ -293,6 +304,7 @@ def _command(
         command.add_argument("--output", type=Path, default=Path(folder), metavar="DIR", help="default: %(default)s")
     command.add_argument("--json", action="store_true", help="print one JSON document on stdout, and nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress, no table")
+    command.add_argument("--verbose", action="store_true", help="also print the details of the computation")
     return command
 
 

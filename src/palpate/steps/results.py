@@ -120,13 +120,14 @@ class CaseResult(_Shown, result.CaseResult):
         """Colour (#rrggbb) of each tissue."""
         return {t.name: colour for t, colour in zip(self.tissues, tissue_colours(self.tissues), strict=True)}
 
-    def save(self, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+    def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> tuple[Path, ...]:
         """Write result.json, report.html, mesh.vtu ... into `folder`, as `palpate estimate` does, all or none of them.
 
-        Gives the paths that were written. Raises `ConfigurationError` where the folder holds another case.toml of
-        somebody's own, `ResourceError` where another run works there or the disk refuses.
+        overwrite: replace the result of another case there. Gives the paths that were written. Raises
+        `ConfigurationError` where the folder holds the result of another case, or a case.toml of somebody's own,
+        `ResourceError` where another run works there or the disk refuses.
         """
-        outputs = OutputFolder(Path(folder))
+        outputs = OutputFolder(Path(folder), overwrite=overwrite)
         with held_folder(outputs.path):
             refuse_other_case(self.case, outputs)
             save_estimate(self, outputs)

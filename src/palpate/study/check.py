@@ -23,7 +23,7 @@ from palpate.images.readers import read_intensities
 from palpate.images.registration import Registration, length_text
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.progress import Progress
+from palpate.progress import Line, Progress
 from palpate.study.body import Body, cost_of_bodies, joint_problem, make_body
 from palpate.study.case import Case
 from palpate.study.case_file import read_case
@@ -224,7 +224,7 @@ def checked_case(
     else:
         return Checked(CheckReport(source.stem, problems.all()))
     problems.warn((*unit_warnings(case), *load_warnings(case)))
-    progress("reading the images")
+    progress(Line("reading the images"))
     images = problems.attempt(partial(read_case_images, case, progress=progress))
     pairs = _further_problems(problems, case, progress) if images is None else images.pairs
     if not pairs:

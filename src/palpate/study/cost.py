@@ -28,8 +28,9 @@ LATTICE = 64  # points of the lattice along the longest side, on which edge leng
 # Fitted to runs of benchmarks/cost.py (docs/command-line.md), between machines that take 110 and 160 s for the demo.
 TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
-FIXED_S: Mapping[Stage, float] = {"reading": 5.0, "linear law": 4.0, "intervals": 5.0, "report": 8.0}
+FIXED_S: Mapping[Stage, float] = {"read": 5.0, "assemble": 1.0, "search": 3.0, "intervals": 13.0}
 SECONDS_AN_UNKNOWN = 4.6e-4  # beside the solver, with 90 modes a driver, for each later image
+ASSEMBLING = 0.1  # of that: distances to the surfaces and stiffness matrices
 FINITE_STRAIN_S = 4.2e-4  # the same of equilibria and their derivatives at finite strain
 INTERVALS_S = 4.6e-4  # the same of intervals, and of what would change the answer
 FROM_REST = 2  # further passes, each with a linear one, where the state without loads is found with the moduli
@@ -50,7 +51,7 @@ SERIES = 30  # right-hand sides beside the modes
 class ExpectedCost:
     """Size of the mesh and of the linear systems, peak memory (GB), time (s), and what they were predicted for.
 
-    stages: of the time, what each stage takes (s), in their order.
+    stages: of the time, what each stage takes (s), in their order; the last one with the report.
     """
 
     tets: int
@@ -99,11 +100,12 @@ def cost_of_meshes(
     for tets, unknowns in meshes:
         _, solving = expected_of_size(unknowns, case.driver.modes + SERIES, solver=solver)
         work = unknowns * modes * max(n_after, 1)
-        took["meshing"] += (case.body is None) * SECONDS_A_CUT * tets * (len(before.tissues) - 1) * shorter
-        took["linear law"] += SECONDS_AN_UNKNOWN * work * shorter + solving.seconds
-        took["finite strain"] += finite * FINITE_STRAIN_S * work * shorter
+        took["mesh"] += (case.body is None) * SECONDS_A_CUT * tets * (len(before.tissues) - 1) * shorter
+        took["assemble"] += ASSEMBLING * SECONDS_AN_UNKNOWN * work * shorter
+        took["search"] += (1.0 - ASSEMBLING) * SECONDS_AN_UNKNOWN * work * shorter + solving.seconds
+        took["check the law"] += finite * FINITE_STRAIN_S * work * shorter
         if case.strained_reference:
-            took["finite strain"] += FROM_REST * (SECONDS_AN_UNKNOWN + FINITE_STRAIN_S) * work * shorter
+            took["check the law"] += FROM_REST * (SECONDS_AN_UNKNOWN + FINITE_STRAIN_S) * work * shorter
         took["intervals"] += INTERVALS_S * work * shorter
         took["intervals"] += SECONDS_A_DRAW * case.estimate.samples * modes * max(n_after, 1)
         gigabytes += GB_AN_UNKNOWN * work + solving.bytes / 1e9

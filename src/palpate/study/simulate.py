@@ -24,7 +24,7 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.motion import wall_filling
-from palpate.progress import Progress, silent
+from palpate.progress import Line, Progress, silent
 from palpate.study.body import Body, inverse_problem, make_body, strained_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
@@ -52,14 +52,14 @@ def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simu
         summary = MeshSummary.of(mesh_figures(space.mesh), space)
         displacements = tuple(scene.displacement * (step / steps) for step in range(1, steps + 1))
     else:
-        progress("reading and aligning the images")
+        progress(Line("reading the images"))
         states = read_states(case, progress=progress)
         inputs = input_digests(case, states.inputs)
         tissues = states.before.tissues
         _refuse_unknown(tissues)
         body = make_body(states, case, progress=progress)
         space, summary = body.space, MeshSummary.of(body.quality, body.space, body.edge_length)
-        progress("solving for the displacement")
+        progress(Line("solving for the displacement"))
         shares = [step / steps for step in range(1, steps + 1)]
         if case.motion is None and states.after:
             problem = inverse_problem(body, case, progress=progress)
