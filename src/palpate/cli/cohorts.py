@@ -93,7 +93,7 @@ def statistics(_: argparse.Namespace, case: None, outputs: OutputFolder, progres
     document = read_json(outputs.path / "statistics.json")
     files = f"written to {outputs.path}: {', '.join(TARGETS[:-1])}"
     opening = f"open {outputs.path / 'cohort.html'}"
-    return Outcome(document, "\n".join([_associations(document), *_left_out(document), files, opening]))
+    return Outcome(document, "\n".join([_associations(document), *left_out_rows(document), files, opening]))
 
 
 def _engine(arguments: argparse.Namespace, folder: Path) -> Engine:
@@ -133,12 +133,12 @@ def _told(records: Sequence[Record], folder: Path) -> Outcome:
     summary = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
     files = f"written to {folder}: {', '.join(TARGETS[:-1])}, cases/"
     opening = f"open {folder / 'cohort.html'}"
-    text = "\n".join([*lines, _associations(found), *_left_out(found), summary, files, opening])
+    text = "\n".join([*lines, _associations(found), *left_out_rows(found), summary, files, opening])
     left = f"{counts['waiting']} rows are waiting: --resume goes on with them" if counts["waiting"] else ""
     return Outcome(document, text, ResourceError.exit_code if left else 0, left)
 
 
-def _left_out(document: dict[str, Any]) -> list[str]:
+def left_out_rows(document: dict[str, Any]) -> list[str]:
     """The rows that are done and do not enter the statistics, one line for each reason; empty where all enter."""
     unfit, unknown = dict[str, dict[str, None]](), list[str]()
     for tissue, organ in document["organs"].items():

@@ -22,9 +22,10 @@ from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase
 from palpate.study.null_pair import NullPair, noise_of_drawings
 from palpate.study.outputs import RESULT, OutputFolder, read_json
-from palpate.study.result import SCHEMA
+from palpate.study.result import SCHEMA, MeshResult, Simulation
 from palpate.study.sensitivity import Kept, Sensitivity
 from palpate.study.sensitivity import sensitivity as vary
+from palpate.study.simulate import simulate as simulated
 from palpate.study.surface_labels import SurfaceLabels, surface_labels
 
 PathLike = str | os.PathLike[str]
@@ -151,6 +152,29 @@ def estimate(
     with shown_in_python(progress) as tell:
         found = run.estimate(case, progress=tell, truth=truth)
     return CaseResult(**{field.name: getattr(found, field.name) for field in fields(found)})
+
+
+def make_mesh(case: Case, *, progress: Wanted = "auto") -> MeshResult:
+    """The tetrahedra of a case's reference image, whose quality was checked, as `palpate mesh` makes them.
+
+    progress: as in `estimate`. Raises `InputDataError` for images that cannot be used, `GeometryError` for organs that
+    cannot be meshed, `MeshQualityError` for a mesh that is not fit to compute with.
+    """
+    with shown_in_python(progress) as tell:
+        return run.make_mesh(case, progress=tell)
+
+
+def simulate(case: Case, *, steps: int = 1, progress: Wanted = "auto") -> Simulation:
+    """A later state of a case whose tissues all state their `youngs_modulus_kpa`, under its law, motion and loads.
+
+    The driver moves as in the later image (its wall is fitted together with the organs' surfaces, the moduli held),
+    by [motion] filling_mm, or as in the [phantom]. steps: how many states to give, each in equilibrium at its share
+    of the motion, the last one the whole (of a phantom, shares of its displacement); progress: as in `estimate`.
+    Raises as `make_mesh` does, and `ConfigurationError` when a modulus is missing, `NotConverged` where a
+    finite-strain path ends early.
+    """
+    with shown_in_python(progress) as tell:
+        return simulated(case, steps=steps, progress=tell)
 
 
 def sensitivity(

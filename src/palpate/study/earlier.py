@@ -45,8 +45,9 @@ def refuse_other_case(case: Case, outputs: OutputFolder) -> None:
     there = "" if outputs.overwrite else _other_result(case, outputs.path)
     if there:
         raise ConfigurationError(
-            f"{outputs.path} holds the result of another case, {there}, and this case is {_named(case)}: choose another"
-            " output folder, or replace that result with --overwrite (in Python, overwrite=True)"
+            f"{outputs.path} holds the result of another case, {there}; this one is"
+            f" {_named(case.id, case.patient, case)}. Choose another output folder, or replace that result with"
+            " --overwrite (in Python: overwrite=True)"
         )
     path = outputs.path / CASE_NAME
     if CASE_NAME in outputs.written or not path.exists():
@@ -61,34 +62,42 @@ def refuse_other_case(case: Case, outputs: OutputFolder) -> None:
 def _other_result(case: Case, folder: Path) -> str:
     """The case whose values result.json in the folder holds, in words, where it is another one than `case`.
 
-    The same case, edited, has the same id and patient, and a first image at the same place or with the same content.
+    The same case, edited, is the folder's own case.toml, or has the same id and patient, and a first image at the same
+    place or with the same content.
     """
     try:
         document = read_json(folder / RESULT)
     except InputDataError:
         return ""
-    if document.get("schema") != SCHEMA or document.get("status") != "converged":  # nothing would be lost
+    lost = document.get("schema") == SCHEMA and document.get("status") == "converged"
+    if not lost or _says(folder / CASE_NAME, case):
         return ""
-    name, patient = (shortened(str(document.get(key))) for key in ("id", "patient"))
     try:
         earlier = read_case(folder / CASE_NAME)
     except PalpateError:  # it was moved, or is of a later version
         earlier = None
-    if (name, patient) == (case.id, case.patient):
-        if earlier is None or earlier.images is None or case.images is None:
-            return ""
-        first = case.images.before
-        if first.resolve() == earlier.images.before.resolve():
-            return ""
-        if first.is_file() and sha256_of(first) in str(document.get("inputs")):
-            return ""
-    image = f", image {earlier.images.before}" if earlier is not None and earlier.images is not None else ""
-    return f"'{name}' (patient '{patient}'{image})"
+    name, patient = (shortened(str(document.get(key))) for key in ("id", "patient"))
+    if (name, patient) == (case.id, case.patient) and _same_image(case, earlier, document):
+        return ""
+    return _named(name, patient, earlier)
 
 
-def _named(case: Case) -> str:
-    image = f", image {case.images.before}" if case.images is not None else ""
-    return f"'{case.id}' (patient '{case.patient}'{image})"
+def _same_image(case: Case, earlier: Case | None, document: Mapping[str, Any]) -> bool:
+    """Whether two cases have the same first image, by its place or content, or nobody can tell."""
+    if earlier is None or earlier.images is None or case.images is None:
+        return True
+    first, inputs = case.images.before, document.get("inputs")
+    if first.resolve() == earlier.images.before.resolve():
+        return True
+    digest = inputs.get("before") if isinstance(inputs, dict) else None
+    return first.is_file() and digest == {"sha256": sha256_of(first)}
+
+
+def _named(name: str, patient: str, case: Case | None) -> str:
+    """A case in a few words: its id, its patient if that is called otherwise, its first image."""
+    of = f" of patient '{patient}'" if patient != name else ""
+    image = f" (before: {case.images.before})" if case is not None and case.images is not None else ""
+    return f"'{name}'{of}{image}"
 
 
 def stage_case(case: Case, staging: Staging) -> tuple[Finding, ...]:

@@ -138,11 +138,7 @@ def estimate_states(
 
 
 def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
-    """The tetrahedra of a case's reference image, passed through the gate on their quality, as `palpate mesh` has them.
-
-    progress: is called with a sentence at each stage. Raises `InputDataError` for images that cannot be used,
-    `GeometryError` for organs that cannot be meshed, `MeshQualityError` for a mesh that fails its gate.
-    """
+    """The tetrahedra of a case's reference image, as `palpate.make_mesh` gives them; raises as that does."""
     began = time.perf_counter()
     progress(Line("reading the images"))
     states = read_states(case, progress=progress)

@@ -35,14 +35,7 @@ from palpate.study.result import MeshSummary, Provenance, Simulation
 
 
 def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simulation:
-    """A later state of a case whose tissues all state their `youngs_modulus_kpa`, under its law, motion and loads.
-
-    The driver moves as in the later image (its wall is fitted together with the organs' surfaces, the moduli held),
-    by [motion] filling_mm, or as in the [phantom]. steps: how many states to give, each in equilibrium at its share
-    of the motion, the last one the whole (of a phantom, shares of its displacement); progress: is called with a
-    sentence at each stage. Raises as `make_mesh` does, and `ConfigurationError` when a modulus is missing,
-    `NotConverged` where a finite-strain path ends early.
-    """
+    """The later states of a case, as `palpate.simulate` gives them; raises as that does."""
     began = time.perf_counter()
     inputs: Mapping[str, str] = {}
     if case.phantom is not None:
