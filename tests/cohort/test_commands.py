@@ -137,7 +137,7 @@ class NoEngine:
 
     name = "none"
 
-    def outcomes(self, tasks):
+    def outcomes(self, _):
         return iter(())
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from palpate.study.outputs import OutputFolder
 
 
-INTERRUPTED = "the plan and the rows that are done, with which --resume goes on"
+INTERRUPTED = "the plan and the finished rows; --resume goes on from there"
 MOST_TOLD = 20  # failed rows
 MOST_NAMED = 5  # rows that are left out for one reason
 TARGETS = ("cohort.csv", "cohort.parquet", "cohort.html", "statistics.json", "plan.json")
@@ -129,7 +129,7 @@ def _told(records: Sequence[Record], folder: Path) -> Outcome:
     failed = [record for record in records if record.failure_class]
     lines = [f"{record.row.id} failed ({record.failure_class}): {record.message}" for record in failed[:MOST_TOLD]]
     if len(failed) > MOST_TOLD:
-        lines.append(f"and {len(failed) - MOST_TOLD} more, which stand in cohort.csv")
+        lines.append(f"and {len(failed) - MOST_TOLD} more, see cohort.csv")
     summary = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
     files = f"written to {folder}: {', '.join(TARGETS[:-1])}, cases/"
     opening = f"open {folder / 'cohort.html'}"

@@ -29,9 +29,9 @@ LARGEST = 2**31 - 1  # of mallopt
 KEPT = ((-1, LARGEST), (-3, LARGEST), (-8, 1))  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD in bytes, M_ARENA_MAX; malloc.h
 UNEXPECTED = 1
 INTERRUPTED = 130  # as a shell has it
-UNTOUCHED = "interrupted; files that were already there are as they were; the same command starts anew"
-REPLACED = "interrupted after these files had taken their places: {}"
-SPEAKING = "interrupted while its outcome was printed; what it had to write is written"
+UNTOUCHED = "interrupted; no file was changed; give the same command again"
+REPLACED = "interrupted after these files were written: {}"
+SPEAKING = "interrupted while the outcome was printed; all files are written"
 
 
 def run(argv: Sequence[str] | None, signals: Sequence[signal.Signals], mask: Iterable[int]) -> int:
@@ -181,6 +181,6 @@ def _speak(outcome: Outcome, arguments: argparse.Namespace) -> int:
     if refused is None or refused.errno == errno.EPIPE:  # a reader that has left wants no more
         return outcome.exit_code
     reason = refused.strerror or str(refused)
-    where = f"; what the run had to write is whole in {arguments.output}" if arguments.output else ""
+    where = f"; all files are written in {arguments.output}" if arguments.output else ""
     tell(f"palpate: the document of --json could not be written to standard output ({reason}){where}", sys.stderr)
     return outcome.exit_code or ResourceError.exit_code

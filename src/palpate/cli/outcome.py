@@ -39,9 +39,8 @@ def estimates_table(document: Mapping[str, Any]) -> str:
     for item in moduli_in(document):
         interval, ratio = item["interval95"], number(item["ratio"])
         value, unit = number(item["value"]) + (" kPa" if item["value"] is not None else ""), " kPa"
-        if item["verdict"] == "ratio only" and item["value"] is not None:  # whose scale is known within a range
-            value += f" if {item['relative_to']} has {number(item['value'] / item['ratio'])}"
-            interval, unit = item["ratio_interval95"], " (ratio)"
+        if item["verdict"] == "ratio only" and item["ratio"] is not None:  # the scale in kPa is not known well enough
+            value, interval, unit = f"{ratio} x {item['relative_to']}", item["ratio_interval95"], " (ratio)"
         if interval is None and item["ratio_interval95"] is not None:
             interval, unit = item["ratio_interval95"], " (ratio)"
         rows.append(
@@ -63,8 +62,8 @@ def estimates_table(document: Mapping[str, Any]) -> str:
         found, ends = main_numbers(item)
         if found and item["truth"] and (share := expected_share(found, ends, item["truth"])) != NONE:
             error = f"{100.0 * (found / item['truth'] - 1.0):+.0f} %"
-            far.append(f"{item['tissue']} {error} ({share} of such estimates are off as far or further)")
-    more += [f"error, and how often it is as large by the interval: {', '.join(far)}"] if far else []
+            far.append(f"{item['tissue']} {error} ({share} of estimates with this interval are off by as much or more)")
+    more += [f"error against the truth: {', '.join(far)}"] if far else []
     maps = [item["words"] for item in document.get("maps", ())]
     note = [document["note"]] if document.get("note") else []
     return "\n".join([columns(rows), *more, *maps, *note])
