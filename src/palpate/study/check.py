@@ -84,6 +84,10 @@ class CheckReport:
     measured: Mapping[str, str] = field(default_factory=dict)
     predicted: Prediction | None = None
 
+    def __str__(self) -> str:
+        """What `palpate check` prints."""
+        return self.text()
+
     @property
     def exit_code(self) -> int:
         """0, or that of the first problem, with which an estimate would end."""
