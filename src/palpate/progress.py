@@ -6,7 +6,7 @@ Whatever is said is a text. A `Line` or a `Forecast` is for everybody; any other
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 Progress = Callable[[str], None]  # is called with a sentence
 Wanted = (
@@ -32,9 +32,9 @@ class Told(str):
         made.stage = stage
         return made
 
-    def __getnewargs__(self) -> tuple[str, Stage]:
-        """What it is made of, in another process."""
-        return str(self), self.stage
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How it is made in another process."""
+        return Told, (str(self), self.stage)
 
     stage: Stage
 
@@ -50,9 +50,9 @@ class Line(str):
         made.stage = stage
         return made
 
-    def __getnewargs__(self) -> tuple[str]:
-        """The whole sentence, in another process; its stage follows."""
-        return (str(self),)
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How it is made in another process: the whole sentence, then its stage."""
+        return Line, (str(self),), (None, {"stage": self.stage})
 
     stage: Stage | None
 
@@ -68,9 +68,9 @@ class Forecast(str):
         forecast.seconds = dict(seconds)
         return forecast
 
-    def __getnewargs__(self) -> tuple[str, dict[Stage, float]]:
-        """What it is made of, in another process."""
-        return str(self), self.seconds
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How it is made in another process."""
+        return Forecast, (str(self), self.seconds)
 
     seconds: dict[Stage, float]
 
