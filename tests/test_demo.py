@@ -13,7 +13,7 @@ import pytest
 
 from palpate.cli import main
 from palpate.demo import DATA, run_demo
-from palpate.progress import STAGES, Forecast, Told
+from palpate.progress import STAGES, Forecast, Line, Told
 from palpate.study import read_case
 from palpate.study.outputs import RESULT, RESULT_FILES
 
@@ -65,8 +65,9 @@ def test_the_demo_warns_of_nothing_and_tells_what_a_bar_needs(demo):
     result, heard = demo
     assert result.all_remarks == ()
     forecasts = [sentence for sentence in heard if isinstance(sentence, Forecast)]
-    stages = dict.fromkeys(sentence.stage for sentence in heard if isinstance(sentence, Told))
-    assert tuple(stages) == STAGES[:-1]  # the report is the caller's
+    told = dict.fromkeys(sentence.stage for sentence in heard if isinstance(sentence, Told))
+    lines = [sentence.stage for sentence in heard if isinstance(sentence, Line) and sentence.stage]
+    assert tuple(told) == tuple(lines) == STAGES  # each of them in a line of its own
     assert len(forecasts) == 2  # of the images, and of the mesh
     assert all(tuple(each.seconds) == STAGES and min(each.seconds.values()) > 0.0 for each in forecasts)
 

@@ -71,11 +71,11 @@ def test_init_check_and_estimate_first_predict_the_same_cost(folder):
 
     with pytest.raises(KeyboardInterrupt):
         palpate.estimate(case, progress=until_the_forecast)
-    first = next(sentence for sentence in checked if sentence.startswith("expected: "))
+    first = next(sentence for sentence in checked if sentence.startswith("an estimate takes "))
     assert estimated[-1] == first
     states = read_states(case)
     guessed = expected_cost(case, states.before, states.after, n_pairs=1)
-    assert first == f"expected: {guessed.in_words}"
+    assert first == guessed.sentence
     assert f"<dd>{guessed.time_words} on " in page
     assert f"<dd>{guessed.memory_words}</dd>" in page
     least, most = guessed.between

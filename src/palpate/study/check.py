@@ -23,7 +23,7 @@ from palpate.images.readers import read_intensities
 from palpate.images.registration import Registration, length_text
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.progress import Progress
+from palpate.progress import Line, Progress
 from palpate.study.body import Body, cost_of_bodies, joint_problem, make_body
 from palpate.study.case import Case
 from palpate.study.case_file import read_case
@@ -83,6 +83,10 @@ class CheckReport:
     alignments: tuple[tuple[str, Registration], ...] = ()
     measured: Mapping[str, str] = field(default_factory=dict)
     predicted: Prediction | None = None
+
+    def __str__(self) -> str:
+        """What `palpate check` prints."""
+        return self.text()
 
     @property
     def exit_code(self) -> int:
@@ -221,7 +225,7 @@ def checked_case(
     else:
         return Checked(CheckReport(source.stem, problems.all()))
     problems.warn((*unit_warnings(case), *load_warnings(case)))
-    progress("reading the images")
+    progress(Line("reading the images"))
     images = problems.attempt(partial(read_case_images, case, progress=progress))
     pairs = _further_problems(problems, case, progress) if images is None else images.pairs
     if not pairs:
@@ -269,7 +273,7 @@ def _cost(
     """
     first = pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs), mesh=first.mesh)
-    progress(f"expected: {cost.in_words}")
+    progress(Line(cost.sentence))
     if problems.refused or not meshed or lack_of_memory(cost):
         problems.found += memory_problems(cost)
         return cost, ()
