@@ -24,6 +24,7 @@ __all__ = ["PARTS", "Part", "Place", "Run"]
 Values = dict[str, Any]  # of JSON: texts, numbers, lists of lines, and branches of these
 
 RESULTS = ROOT / "benchmarks" / "results"
+PICTURES = ROOT / "docs" / "pictures"
 PALPATE = [sys.executable, "-m", "palpate"]
 STATED = ("identified", "weak")
 VERDICTS = (*STATED, "not identified")
@@ -388,14 +389,11 @@ def pictures(place: Place) -> Values:
     if not (folder / "report.html").exists():
         demo(place)
     browser = ["--browser", place.browser] if place.browser else []
-    here = ROOT / "docs" / "pictures"
-    for script in DRAWN:
-        if (here / script).exists():
-            run([sys.executable, here / script, folder, *browser])
-    return {name: digest(here / name) for name in ("demo.png", "report.jpg")}
-
-
-DRAWN = ("draw.py", "gallery.py")  # each takes the demo's folder
+    for script, flags in (("draw.py", browser), ("gallery.py", [])):
+        if (PICTURES / script).exists():
+            run([sys.executable, PICTURES / script, folder, *flags])
+    drawn = [PICTURES / "demo.png", PICTURES / "report.jpg", *sorted(PICTURES.glob("gallery-*.*"))]
+    return {picture.name: digest(picture) for picture in drawn}
 
 
 def rms(values: Iterable[float], digits: int) -> float:
@@ -426,6 +424,6 @@ PARTS = {
     "coverage": Part("python benchmarks/coverage.py --bodies 1 --draws 4 --first-seed 501", 35, coverage),
     "speed": Part("python benchmarks/speed.py --parts default", 5, speed),
     "verification": Part("palpate verify", 5, verification),
-    "pictures": Part("python docs/pictures/draw.py", 1, pictures),
+    "pictures": Part("python docs/pictures/draw.py", 3, pictures),
     "pairs": Part("python benchmarks/pairs.py --patients 20 --first-seed 701", 300, pairs, asked=True),
 }
