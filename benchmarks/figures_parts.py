@@ -114,7 +114,15 @@ def demo(place: Place) -> Values:
     found = run([*PALPATE, "demo", "--output", folder, "--quiet"])
     document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
     table = [line for line in found.text.splitlines() if line][: 2 + len(document["estimates"])]
-    words = [*PALPATE, "check", folder / "case.toml", "--html", place.folder / "check.html", "--json", "--quiet"]
+    words: list[str | Path] = [
+        *PALPATE,
+        "check",
+        folder / "case.toml",
+        "--html",
+        place.folder / "check.html",
+        "--json",
+        "--quiet",
+    ]
     predicted = json.loads(run(words).text)["predicted"]["moduli"]
     return {
         "result": table,
