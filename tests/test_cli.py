@@ -122,6 +122,7 @@ def test_an_estimate_writes_all_its_files(case_file, tmp_path, capfd):
     assert "58.9 kPa" in out
     assert "47.1 to 73.6 kPa" in out
     assert "warning (example): a warning to be shown" in out
+    assert out.splitlines()[-1] == f"open {tmp_path / 'out' / 'report.html'}"
     assert "working" in err
     assert "a detail" not in err
     assert all(said in (tmp_path / "out" / "log.txt").read_text() for said in ("working", "a detail"))

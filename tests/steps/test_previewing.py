@@ -134,3 +134,14 @@ def test_a_case_that_is_refused_has_a_page_without_prediction(folder):
     assert found.exit_code == 3
     assert found.predicted is None
     assert "the problems come first" in (folder / "look.html").read_text(encoding="utf-8")
+
+
+def test_without_a_name_the_page_of_a_check_lies_beside_the_case(tmp_path, capsys):
+    path = tmp_path / "case.toml"
+    path.write_text('[images]\nbefore = "nowhere.nii.gz"\nafter = ["nowhere.nii.gz"]\n')
+    assert main(["check", str(path), "--html"]) > 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"open {tmp_path / 'preview.html'}"
+    assert (tmp_path / "preview.html").is_file()
+    with pytest.raises(SystemExit):
+        main(["check", "--html", str(path)])
+    assert "CASE.TOML; give it before the options" in capsys.readouterr().err

@@ -113,7 +113,7 @@ def _engine(arguments: argparse.Namespace, folder: Path) -> Engine:
 
 
 def _told(records: Sequence[Record], folder: Path) -> Outcome:
-    """What came of the rows; an exit code above 0 when any of them is still waiting."""
+    """The outcome of the rows; an exit code above 0 when any of them is still waiting."""
     from palpate.study.outputs import read_json
 
     states = [record.state for record in records]
@@ -156,10 +156,10 @@ def _of_rows(rows: Sequence[str], reason: str) -> str:
 
 
 def _associations(document: dict[str, Any]) -> str:
-    """What each tissue's modulus has to do with the stage, a line each, and images that patients share."""
+    """How the modulus of each tissue depends on the stage, one line each, and images that patients share."""
     from palpate.report.rows import interval_text, number
 
-    rows = [["tissue", "patients", "scans", "without a value", "factor a stage", "95 %", "p"]]
+    rows = [["tissue", "patients", "scans", "without a value", "factor per stage", "95 %", "p"]]
     for tissue, organ in document["organs"].items():
         found, used = organ["regression"], organ["used"]
         cells = [found.get("undefined", ""), "", ""]
