@@ -111,7 +111,7 @@ def kept(place: Place, name: str) -> Path:
 def demo(place: Place) -> Values:
     """The demo as a user runs it."""
     folder = place.folder / "demo"
-    found = run([*PALPATE, "demo", "--output", folder, "--quiet"])
+    found = run([*PALPATE, "demo", "--output", folder])
     document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
     table = [line for line in found.text.splitlines() if line][: 2 + len(document["estimates"])]
     words: list[str | Path] = [
