@@ -69,7 +69,10 @@ class ExpectedCost:
     def time_words(self) -> str:
         """The time in words: "about 2 minutes", before the mesh is known a range."""
         least, most = (about(each.seconds) for each in self.between or (self, self))
-        return f"about {least}" if least == most else f"{least} to {most}"
+        if least == most:
+            return f"about {least}"
+        number, _, unit = least.partition(" ")
+        return f"{number if most.endswith(f' {unit}') and unit else least} to {most}"
 
     @property
     def memory_words(self) -> str:
