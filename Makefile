@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: commands install demo test acceptance quick style lint check clean pardiso benchmark-setup schemas docs lock dist dist-test minimum report-check export-check
+.PHONY: commands install demo test acceptance quick style lint check clean pardiso benchmark-setup schemas docs lock dist dist-test minimum report-check export-check figures
 
 install: $(VENV)/.installed
 
@@ -73,6 +73,13 @@ report-check: install $(AXE)
 $(AXE):
 	mkdir -p build/axe
 	cd build/axe && npm pack --silent axe-core@4 && tar xzf axe-core-*.tgz
+
+# Every figure that README and docs state, and their pictures, into docs/figures.json and the pages: about two hours on
+# two quiet cores. PARTS="demo examples" runs some parts alone, PARTS=text none: it writes what the file says. BODIES=6
+# takes more bodies for accuracy, mismatch and coverage, and as many times as long.
+figures: install
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[browser]"
+	$(BIN)/python benchmarks/figures.py $(PARTS) $(if $(BODIES),--bodies $(BODIES)) $(if $(BROWSER),--browser $(BROWSER))
 
 # case.schema.json, which the package ships, from the dataclasses that read a case.
 schemas: install

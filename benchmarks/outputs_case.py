@@ -76,7 +76,7 @@ class Bench:
         """The command line of a trial."""
         images = [str(self.root / f"{name}.nii.gz") for name in ("before", "after")]
         return {
-            "estimate": ["estimate", str(self.root / "case.toml"), "--output", str(output), "--quiet"],
+            "estimate": ["estimate", str(self.root / "case.toml"), "--output", str(output), "--quiet", "--overwrite"],
             "mesh": ["mesh", str(self.root / "case.toml"), "--output", str(output), "--quiet"],
             "report": ["report", str(output), "--quiet"],
             "init": ["init", *images, "--output", str(output), "--quiet"],

@@ -20,6 +20,7 @@ from palpate.cli.parser import EXAMPLES, make_parser
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import ImageFormat
 from palpate.images.readers.registry import register
+from palpate.progress import Line
 from palpate.study import run
 from palpate.study import simulate as simulation
 from palpate.study.case_file import read_case
@@ -95,7 +96,8 @@ def runner(monkeypatch, case_result):
 
     def estimate(_, *, progress, truth):
         assert truth is None
-        progress("working")
+        progress(Line("working"))
+        progress("a detail")
         return case_result
 
     def install(**functions):
@@ -120,8 +122,10 @@ def test_an_estimate_writes_all_its_files(case_file, tmp_path, capfd):
     assert "58.9 kPa" in out
     assert "47.1 to 73.6 kPa" in out
     assert "warning (example): a warning to be shown" in out
+    assert out.splitlines()[-1] == f"open {tmp_path / 'out' / 'report.html'}"
     assert "working" in err
-    assert "working" in (tmp_path / "out" / "log.txt").read_text()
+    assert "a detail" not in err
+    assert all(said in (tmp_path / "out" / "log.txt").read_text() for said in ("working", "a detail"))
 
 
 @pytest.mark.usefixtures("runner")

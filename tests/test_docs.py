@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ast
+import importlib.util
 import re
 import tomllib
 from itertools import chain
 from pathlib import Path
+from pkgutil import resolve_name
 
 import pytest
+from markdown_it import MarkdownIt
 
 import palpate
 from palpate.findings import CODES, HARMLESS, MISLEADING, WIDENING
@@ -143,3 +146,69 @@ def test_every_dependency_is_used():
 def test_every_dependency_has_its_line():
     told = (ROOT / "docs" / "libraries.md").read_text().lower()
     assert [name for name in requirements() if not re.search(rf"\b{name.lower()}\b", told)] == []
+
+
+def figures_text():
+    """The module that writes figures into pages; benchmarks/ is no package."""
+    spec = importlib.util.spec_from_file_location("figures_text", ROOT / "benchmarks" / "figures_text.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+TEXT = figures_text()
+FIGURES = TEXT.read_figures()
+STATED = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in TEXT.pages()}
+COMMIT = r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*\d)[0-9a-f]{7,8}\b"  # letters and digits
+
+
+def test_every_figure_of_a_page_is_that_of_the_file_and_every_figure_of_the_file_stands_in_a_page():
+    assert list(TEXT.complaints(STATED, FIGURES)) == []
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        lambda text: re.sub(r"(?<=<!--mismatch.linear.held-->)\d+", "142", text),
+        lambda text: text.replace("| `still` | 6 |", "| `still` | 7 |", 1),
+        lambda text: text.replace("<!--mismatch.linear.held-->", "", 1),
+        lambda text: re.sub(r"<!--mismatch.linear.held-->(\d+)<!--/-->", r"\1", text),
+        lambda text: text.replace("<!--mismatch.linear.held-->", "<!--mismatch.linear.hold-->", 1),
+        lambda text: text.replace(" <!--mismatch.linear.held-->", "\n<!--mismatch.linear.held-->", 1),
+    ],
+    ids=["number", "table", "beginning", "comments", "name", "line"],
+)
+def test_a_figure_that_a_writer_changes_is_seen(spoilt):
+    page = "docs/accuracy.md"
+    changed = spoilt(STATED[page])
+    assert changed != STATED[page]
+    assert any(TEXT.complaints({**STATED, page: changed}, FIGURES))
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/accuracy.md", "docs/speed.md", "docs/verification.md"])
+def test_no_comment_of_a_figure_is_seen_and_its_tables_are_tables(page):
+    html = MarkdownIt("commonmark").enable("table").render(STATED[page])
+    shown = re.sub(r"<!--.*?-->", "", html)
+    assert "<!--" not in shown
+    assert "--&gt;" not in shown
+    views = [name for name in re.findall(r"<!--([\w.-]+)-->\n", STATED[page]) if name in TEXT.VIEWS]
+    assert html.count("<table>") >= len(views)
+
+
+def test_the_commits_of_pages_with_figures_are_those_of_the_file():
+    for page in ("README.md", "docs/accuracy.md"):
+        assert re.findall(COMMIT, TEXT.MARK.sub("", STATED[page])) == []
+
+
+def test_the_pictures_show_the_demo_that_the_figures_are_of():
+    drawn = FIGURES["pictures"]
+    assert drawn["commit"] == FIGURES["demo"]["commit"]
+    for name, digest in drawn["values"].items():
+        assert TEXT.digest(ROOT / "docs" / "pictures" / name) == digest, f"{name} is not the one that was drawn"
+
+
+def test_every_object_of_the_reference_of_python_can_be_found():
+    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    for name in re.findall(r"^::: ([\w.]+)$", page, flags=re.MULTILINE):
+        module, _, item = name.rpartition(".")
+        assert hasattr(resolve_name(module), item), name

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import pickle
 import pty
 import re
 import select
@@ -13,14 +14,15 @@ import subprocess
 import sys
 import termios
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from palpate.cli.progress import place
-from palpate.progress import STAGES, Forecast, about, during
+from palpate.progress import STAGES, Forecast, Line, Told, about, details, during
+from palpate.steps.display import place, shown_in_python
 
-SECONDS = dict(zip(STAGES, (4.0, 8.0, 20.0, 30.0, 4.0, 8.0), strict=True))
+SECONDS = dict(zip(STAGES, (4.0, 8.0, 4.0, 16.0, 30.0, 12.0), strict=True))
 
 
 def run_of(pace, points=400):
@@ -36,7 +38,7 @@ def test_where_the_prediction_is_right_share_and_time_left_are():
     places, shares, left = run_of(np.ones(len(STAGES)))
     assert np.abs([at.share for at in places] - shares).max() < 0.06
     assert np.abs([at.left for at in places] - left).max() < 0.06 * sum(SECONDS.values())
-    assert [at.stage for at in places][-1] == "report"
+    assert [at.stage for at in places][-1] == "intervals"
 
 
 def test_where_all_takes_longer_by_one_factor_the_time_left_learns_it():
@@ -55,19 +57,35 @@ def test_a_share_is_below_one_and_within_a_stage_never_falls(seed):
 
 
 def test_a_stage_that_is_left_out_is_passed_over():
-    seconds = SECONDS | {"finite strain": 0.0}
-    at = place(seconds, {"reading": 0.0, "linear law": 12.0, "intervals": 32.0}, 32.0)
-    assert at.share == pytest.approx((4 + 8 + 20) / (4 + 8 + 20 + 4 + 8))
+    seconds = SECONDS | {"check the law": 0.0}
+    at = place(seconds, {"read": 0.0, "search": 12.0, "intervals": 32.0}, 32.0)
+    assert at.share == pytest.approx((4 + 8 + 4 + 16) / (4 + 8 + 4 + 16 + 12))
 
 
 def test_a_sentence_keeps_the_stage_that_is_its_own():
     heard = []
-    outer = during("linear law", heard.append)
+    outer = during("search", heard.append)
     outer("a")
-    during("finite strain", outer)("b")
+    during("check the law", outer)("b")
     outer(Forecast("c", SECONDS))
-    assert heard == ["a", "b", "c"]
-    assert [getattr(each, "stage", None) for each in heard] == ["linear law", "finite strain", None]
+    outer(Line("d", "intervals"))
+    assert heard == ["a", "b", "c", "intervals: d"]
+    assert [getattr(each, "stage", None) for each in heard] == ["search", "check the law", None, "intervals"]
+
+
+def test_of_one_of_many_estimates_every_sentence_is_a_detail():
+    heard = []
+    for sentence in (Line("17 tetrahedra", "mesh"), Forecast("a minute", SECONDS), "b"):
+        details(heard.append)(sentence)
+    assert heard == ["mesh: 17 tetrahedra", "a minute", "b"]
+    assert {type(each) for each in heard} == {str}
+
+
+@pytest.mark.parametrize("said", [Line("17 tetrahedra", "mesh"), Line("a"), Told("b", "read"), Forecast("c", SECONDS)])
+def test_a_sentence_is_the_same_in_another_process(said):
+    found = pickle.loads(pickle.dumps(said))
+    assert (type(found), found) == (type(said), said)
+    assert all(getattr(found, name) == getattr(said, name) for name in ("stage", "seconds") if hasattr(said, name))
 
 
 def test_times_are_in_plain_words():
@@ -77,24 +95,26 @@ def test_times_are_in_plain_words():
 
 TALK = """
 import sys, time
-from palpate.cli.progress import progress_on_stderr
-from palpate.progress import Forecast, Told, during
-with progress_on_stderr(quiet=QUIET) as progress:
-    during("reading", progress)("reading [the] images")
-    progress(Forecast("about a minute", dict(reading=1.0, meshing=1.0, report=0.5)))
-    during("meshing", progress)("meshing größe")
+from palpate.steps.display import progress_on_stderr
+from palpate.progress import Forecast, Line, during
+with progress_on_stderr(quiet=QUIET, verbose=VERBOSE) as progress:
+    during("read", progress)("279 modes")
+    progress(Line("reading [the] images"))
+    progress(Forecast("about a minute", {"read": 1.0, "mesh": 1.0, "intervals": 0.5}))
+    progress(Line("größe", "mesh"))
+    progress(Forecast("about a minute", {"read": 1.0, "mesh": 1.0, "intervals": 0.5}))
     time.sleep(0.6)
     END
 print("done", file=sys.stderr)
 """
 
 
-def on_a_terminal(end="pass", *, quiet=False, interrupted=False, **variables):
+def on_a_terminal(end="pass", *, quiet=False, verbose=False, interrupted=False, **variables):
     """What a terminal of 80 columns sees of `TALK`, its exit code, and whether the terminal is set as before."""
     leader, follower = pty.openpty()
     fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     before = termios.tcgetattr(follower)
-    code = TALK.replace("QUIET", str(quiet)).replace("END", end)
+    code = TALK.replace("QUIET", str(quiet)).replace("VERBOSE", str(verbose)).replace("END", end)
     plain = {key: value for key, value in os.environ.items() if key not in ("NO_COLOR", "COLUMNS", "TERM")}
     environment = plain | {"TERM": "xterm", "PYTHONIOENCODING": "utf-8"} | variables
     with subprocess.Popen([sys.executable, "-c", code], stderr=follower, env=environment) as process:
@@ -133,7 +153,7 @@ def screen(text):
     return [line.rstrip() for line in lines if line.strip()]
 
 
-LINES = ["reading [the] images", "about a minute", "meshing größe"]
+LINES = ["reading [the] images", "about a minute", "mesh: größe"]
 
 
 def told(text):
@@ -163,6 +183,11 @@ def test_an_error_or_an_interrupt_takes_the_bar_away(end, interrupted, said):
     assert (code != 0, as_before) == (True, True)
 
 
+def test_details_are_seen_by_whoever_asks_for_them():
+    seen, _, _ = on_a_terminal(verbose=True)
+    assert told(seen) == ["279 modes", *LINES, "about a minute", "done"]
+
+
 @pytest.mark.parametrize(("variables", "lines"), [({"TERM": "dumb"}, LINES), ({"quiet": True}, [])])
 def test_a_terminal_that_cannot_be_written_over_sees_lines_and_a_quiet_run_says_nothing(variables, lines):
     seen, code, _ = on_a_terminal(**variables)
@@ -172,9 +197,11 @@ def test_a_terminal_that_cannot_be_written_over_sees_lines_and_a_quiet_run_says_
 
 MUTE = """
 import os, time
-from palpate.cli.progress import progress_on_stderr
+from palpate.steps.display import progress_on_stderr
+from palpate.progress import Forecast, Line
 with progress_on_stderr(quiet=QUIET, patience_s=0.02) as progress:
-    progress("remeshing")
+    progress(Line("remeshing", "mesh"))
+    SAID
     mine = os.dup(2)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # as the mesher does with what its library prints
     time.sleep(0.3)
@@ -184,21 +211,86 @@ with progress_on_stderr(quiet=QUIET, patience_s=0.02) as progress:
 
 @pytest.mark.parametrize("quiet", [False, True])
 def test_no_stage_is_silent_where_no_bar_moves(quiet):
-    code = MUTE.replace("QUIET", str(quiet))
+    code = MUTE.replace("QUIET", str(quiet)).replace("SAID", "pass")
     said = subprocess.run([sys.executable, "-c", code], check=True, stderr=subprocess.PIPE, text=True).stderr
     lines = [re.sub(r"[\d.]+ s", "", line) for line in said.splitlines()]
-    assert lines[:1] == ([] if quiet else ["[   ] remeshing"])
-    assert set(lines[1:]) == (set() if quiet else {"[   ] still, after : remeshing"})
+    assert lines[:1] == ([] if quiet else ["[   ] mesh: remeshing"])
+    assert set(lines[1:]) == (set() if quiet else {"[   ] still at work: mesh: remeshing"})
+
+
+def test_where_no_bar_moves_a_reminder_says_how_far_the_run_is():
+    forecast = 'progress(Forecast("a minute", {"mesh": 60.0, "search": 60.0}))'
+    code = MUTE.replace("QUIET", "False").replace("SAID", forecast)
+    said = subprocess.run([sys.executable, "-c", code], check=True, stderr=subprocess.PIPE, text=True).stderr
+    reminders = {line.partition("] ")[2] for line in said.splitlines()[2:]}
+    assert reminders == {"still at work: mesh, 0 %, 2 minutes left"}
+
+
+ASKED = """
+import sys
+from palpate.progress import Line
+from palpate.steps.display import shown_in_python
+heard = []
+with shown_in_python(WANTED) as tell:
+    tell(Line("seen"))
+    tell("a detail")
+print(heard)
+"""
+
+
+@pytest.mark.parametrize(
+    ("wanted", "printed", "heard"),
+    [
+        ("'auto'", "", "[]"),
+        ("None", "", "[]"),
+        ("False", "", "[]"),
+        ("True", "seen", "[]"),
+        ("heard.append", "", "['seen', 'a detail']"),
+    ],
+)
+def test_a_script_without_a_terminal_is_silent_unless_it_asks(wanted, printed, heard):
+    code = ASKED.replace("WANTED", wanted)
+    said = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert said.stdout.strip() == heard
+    assert said.stderr.strip().partition("] ")[2] == printed
+
+
+def test_a_notebook_without_widgets_shows_lines_and_a_bar_that_goes_away(monkeypatch):
+    contents = []
+    cell = SimpleNamespace(update=lambda content, **_: contents.append(content))
+
+    def display(content, **_):
+        contents.append(content)
+        return cell
+
+    kernel = SimpleNamespace(get_ipython=lambda: SimpleNamespace(kernel=object()))
+    monkeypatch.setitem(sys.modules, "IPython", kernel)
+    monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(display=display))
+    with shown_in_python("auto") as progress:
+        progress(Line("<b>2 images", "read"))
+        progress(Forecast("this takes 2 minutes", {"read": 60.0, "mesh": 60.0}))
+        progress("279 modes")
+    *_, during_it, at_its_end = contents
+    assert "<progress" in during_it["text/html"]
+    assert "read, 0 %, 2 minutes left" in during_it["text/plain"]
+    for content in (during_it, at_its_end):
+        assert "read: &lt;b&gt;2 images" in content["text/html"]
+        assert "modes" not in content["text/plain"]
+    assert "<progress" not in at_its_end["text/html"]
+    assert [line.partition("] ")[2] for line in at_its_end["text/plain"].splitlines()] == [
+        "read: <b>2 images",
+        "this takes 2 minutes",
+    ]
 
 
 def test_letters_that_a_terminal_lacks_are_escaped():
     seen, code, _ = on_a_terminal(PYTHONIOENCODING="ascii")
-    assert (told(seen)[2], code) == ("meshing gr\\xf6\\xdfe", 0)
+    assert (told(seen)[2], code) == ("mesh: gr\\xf6\\xdfe", 0)
 
 
 def test_a_terminal_that_is_closed_costs_no_run():
     leader, follower = pty.openpty()
-    code = TALK.replace("QUIET", "False").replace("END", "pass")
+    code = TALK.replace("QUIET", "False").replace("VERBOSE", "False").replace("END", "pass")
     environment = os.environ | {"TERM": "xterm"}
     with subprocess.Popen([sys.executable, "-c", code], stderr=follower, env=environment) as process:
         os.close(follower)

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from palpate.cli.outcome import MOST_LETTERS, columns
-from palpate.cli.progress import fitted
 from palpate.images.alignment import RigidMotion
 from palpate.images.registration import Registration, length_text
 from palpate.report.tornado import TornadoRow, effect_text
+from palpate.steps.display import fitted
 
 SETTINGS = ", ".join(f"{setting}: -{setting} %" for setting in range(30))
 

@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from palpate.steps.commands import check as check
     from palpate.steps.commands import estimate as estimate
     from palpate.steps.commands import init as init
+    from palpate.steps.commands import make_mesh as make_mesh
     from palpate.steps.commands import noise as noise
     from palpate.steps.commands import read_result as read_result
     from palpate.steps.commands import sensitivity as sensitivity
+    from palpate.steps.commands import simulate as simulate
     from palpate.steps.commands import voxelise as voxelise
     from palpate.steps.results import CaseResult as CaseResult
     from palpate.steps.results import SavedResult as SavedResult
     from palpate.study.case import Case as Case
     from palpate.study.case_file import read_case as read_case
-    from palpate.study.run import make_mesh as make_mesh
-    from palpate.study.simulate import simulate as simulate
 
 _named, _names = front_door(__name__)
 

@@ -1,12 +1,18 @@
-"""What a run says while it works: sentences, of which each may tell its stage, and one what all stages will take."""
+"""What a run says while it works: lines for the person who waits, details for the log, and how long it will take.
+
+Whatever is said is a text. A `Line` or a `Forecast` is for everybody; any other text is a detail, for the log.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 Progress = Callable[[str], None]  # is called with a sentence
-Stage = Literal["reading", "meshing", "linear law", "finite strain", "intervals", "report"]
+Wanted = (
+    Progress | Literal["auto"] | bool | None
+)  # of a function in Python, see `palpate.steps.display.shown_in_python`
+Stage = Literal["read", "mesh", "assemble", "search", "check the law", "intervals"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 
 
@@ -16,7 +22,7 @@ def silent(sentence: str) -> None:
 
 
 class Told(str):
-    """A sentence that is said during a stage."""
+    """A detail that is said during a stage."""
 
     __slots__ = ("stage",)
 
@@ -26,7 +32,29 @@ class Told(str):
         made.stage = stage
         return made
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How it is made in another process."""
+        return Told, (str(self), self.stage)
+
     stage: Stage
+
+
+class Line(str):
+    """A sentence for the person who waits, in plain words; of a stage, whose name it then begins with."""
+
+    __slots__ = ("stage",)
+
+    def __new__(cls, sentence: str, stage: Stage | None = None) -> Line:
+        """The sentence with its stage, if it has one."""
+        made = super().__new__(cls, f"{stage}: {sentence}" if stage else sentence)
+        made.stage = stage
+        return made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How it is made in another process: the whole sentence, then its stage."""
+        return Line, (str(self),), (None, {"stage": self.stage})
+
+    stage: Stage | None
 
 
 class Forecast(str):
@@ -40,17 +68,41 @@ class Forecast(str):
         forecast.seconds = dict(seconds)
         return forecast
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How it is made in another process."""
+        return Forecast, (str(self), self.seconds)
+
     seconds: dict[Stage, float]
 
 
 def during(stage: Stage, progress: Progress) -> Progress:
-    """Sentences told during a stage; those that tell one of their own, within it, keep that."""
+    """What takes the details of a stage; lines, and details that tell their own stage, are handed on as they are."""
 
     def tell(sentence: str) -> None:
         """Hand the sentence on."""
-        progress(sentence if isinstance(sentence, Told | Forecast) else Told(sentence, stage))
+        progress(sentence if isinstance(sentence, Told | Line | Forecast) else Told(sentence, stage))
 
     return tell
+
+
+def details(progress: Progress) -> Progress:
+    """What takes every sentence as a detail: those of one of many estimates, which nobody wants to read one by one."""
+
+    def tell(sentence: str) -> None:
+        """Hand the text on."""
+        progress(str(sentence))
+
+    return tell
+
+
+def grouped(number: int) -> str:
+    """A whole number with spaces between its thousands: 17 283."""
+    return f"{number:,}".replace(",", " ")
+
+
+def counted(number: int, noun: str) -> str:
+    """A number with its noun: 1 image, 17 283 images."""
+    return f"{grouped(number)} {noun}{'' if number == 1 else 's'}"
 
 
 def about(seconds: float) -> str:

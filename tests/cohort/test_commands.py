@@ -11,8 +11,10 @@ import pytest
 
 from palpate.cli import main
 from palpate.cohort.engines.slurm import SlurmEngine, run_part
+from palpate.cohort.run import Options, run_cohort
 from palpate.cohort.task import Limits, Row, Task
-from palpate.errors import ResourceError
+from palpate.errors import ConfigurationError, ResourceError
+from palpate.progress import silent
 from palpate.study.lock import folder_lock
 
 TABLE = "id,patient,stage,before,after\nr0,P,1,b.nii.gz,a.nii.gz\nr1,Q,x,b.nii.gz,a.nii.gz\n"
@@ -128,3 +130,27 @@ def test_without_slurm_its_engine_says_so(tmp_path, environment):
     environment(PATH=str(tmp_path))
     with pytest.raises(ResourceError, match="needs SLURM's sbatch"):
         next(SlurmEngine(tmp_path).outcomes([Task(Row("a", "P"), "nowhere")]))
+
+
+class NoEngine:
+    """One that computes nothing: every row stays as it is."""
+
+    name = "none"
+
+    def outcomes(self, _):
+        return iter(())
+
+
+def test_another_cohort_in_the_folder_is_refused_and_its_own_goes_on(tmp_path):
+    ours, others = ([Row(f"{name}{i}", f"{name}{i}", problem="no image") for i in range(2)] for name in "pq")
+    resumed = Options(resume=True)
+    run_cohort(ours, tmp_path, NoEngine(), Options(), progress=silent)
+    for rows, options, said in (
+        (ours, Options(), "has a cohort already: --resume goes on with it"),
+        (others, resumed, r"has another cohort: none of its 2 rows \('p0' ...\) is in this table"),
+    ):
+        with pytest.raises(ConfigurationError, match=said):
+            run_cohort(rows, tmp_path, NoEngine(), options, progress=silent)
+    run_cohort(ours[:1], tmp_path, NoEngine(), resumed, progress=silent)
+    records = run_cohort(others, tmp_path, NoEngine(), Options(overwrite=True), progress=silent)
+    assert [record.row.id for record in records] == ["q0", "q1"]

@@ -9,6 +9,7 @@ import re
 import numpy as np
 import pytest
 
+from palpate.cli.cohorts import left_out_rows
 from palpate.cohort.page import cohort_page
 from palpate.cohort.plan import Plan, write_mark
 from palpate.cohort.records import Modulus, Record, records_of
@@ -142,6 +143,32 @@ def test_what_is_not_identified_enters_by_its_ends_or_is_left_out_and_named(few)
     assert organ["by_stage"][0]["n_censored"] == 1
     page = cohort_page(changed, document, created="now", version="0")
     assert "not identified, no end known: left out" in page
+
+
+def test_the_table_says_which_rows_enter_the_statistics_and_why_others_do_not(few):
+    unknown = dataclasses.replace(few[1].moduli[0], value=None, low95=None, high95=None, verdict="not identified")
+    changed = [
+        dataclasses.replace(few[0], warnings=("memory", "fold-over")),
+        dataclasses.replace(few[1], moduli=(unknown,)),
+        Record(few[2].row, "failed", "solver", "it stopped"),
+        *few[3:],
+    ]
+    columns, usable = columns_of(changed), usable_scans(changed, "prostate")
+    names = [record.row.id for record, used in zip(changed, columns["used_prostate"], strict=True) if used]
+    assert names == [scan.id for scan in usable.scans] == [record.row.id for record in few[3:]]
+    assert columns["left_out_prostate"][:4] == [
+        "fold-over",
+        "not identified, and no end of its interval is known",
+        "failed",
+        None,
+    ]
+    assert columns["warnings"][:2] == ["memory; fold-over", None]
+    said = left_out_rows(statistics_document(changed))
+    assert said == [
+        f"1 row left out: fold-over ({few[0].row.id})",
+        f"1 row left out: prostate is not identified ({few[1].row.id})",
+    ]
+    assert left_out_rows(statistics_document(few)) == []
 
 
 def test_what_is_not_identified_has_no_number_in_the_table_or_on_the_page(few):

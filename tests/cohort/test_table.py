@@ -158,11 +158,14 @@ def test_cells_that_a_spreadsheet_would_compute_are_texts(tmp_path):
     assert "\x1b" not in lines[1]["patient"]
     numbers = ("prostate_kpa", "prostate_low95", "prostate_high95", "prostate_verdict", "core_ratio")
     assert [lines[0][name] for name in numbers] == ["30.5", "25.0", "", "weak", "3.0"]
-    assert list(lines[0])[:7] == ["id", "patient", "session", "stage", "state", "failure_class", "message"]
+    first = ["id", "patient", "session", "stage", "state", "failure_class", "message", "warnings"]
+    assert list(lines[0])[: len(first)] == first
+    assert [(line["used_prostate"], line["left_out_prostate"]) for line in lines] == [("true", ""), ("false", "failed")]
     write_parquet(records, tmp_path / "cohort.parquet")
     found = pyarrow.parquet.read_table(tmp_path / "cohort.parquet").to_pylist()
     assert found[0]["stage"] == 2
     assert found[0]["prostate_high95"] is None
+    assert [row["used_prostate"] for row in found] == [True, False]
     assert found[1]["state"] == "failed"
 
 

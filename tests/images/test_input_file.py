@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import InputDataError
-from palpate.images.input_file import open_input, read_input
+from palpate.images.input_file import like, open_input, read_input
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_intensities, write_scalar_image
 
@@ -24,6 +24,28 @@ READINGS = {
     "here and there": lambda file: [file.peek(9), file.read(70_000), file.readline(), file.read(1_000_000)],
     "the rest": lambda file: [file.readline(), file.read()],
 }
+
+
+@pytest.mark.parametrize(
+    ("mistyped", "meant"),
+    [
+        ("caes/before.nii.gz", "case/before.nii.gz"),
+        ("case/befor.nii.gz", "case/before.nii.gz"),
+        ("caes/befor.nii.gz", "case"),
+        ("csae", "case"),
+        ("case/quite_another_name", None),
+        ("case", None),
+    ],
+)
+def test_a_mistyped_path_gets_the_one_that_is_like_it(mistyped, meant, tmp_path: Path) -> None:
+    (tmp_path / "case").mkdir()
+    (tmp_path / "case" / "before.nii.gz").write_bytes(CONTENT)
+    hint = like(tmp_path / mistyped)
+    assert hint == ("" if meant is None else f", did you mean '{tmp_path / meant}'?")
+    if "/" in mistyped:
+        with pytest.raises(FileNotFoundError) as caught:
+            open_input(tmp_path / mistyped)
+        assert caught.value.strerror == f"there is no such file{hint}"
 
 
 @pytest.mark.parametrize("name", READINGS)

@@ -31,12 +31,13 @@ def plain_page(data, **_):
 
 @pytest.fixture
 def estimate(tmp_path, monkeypatch, case_result):
-    """Run `palpate estimate` of a patient into the folder `out`.
+    """Run `palpate estimate` of a patient into the folder `out`, whatever case has its result there.
 
-    `meanwhile` is called in the place of the numbers; `draw` draws the page, this time and until another does.
+    `overwrite`: a result of another case is replaced; `meanwhile` is called in the place of the numbers; `draw` draws
+    the page, this time and until another does.
     """
 
-    def run(patient: str, *flags: str, meanwhile=lambda: None, draw=plain_page) -> int:
+    def run(patient: str, *flags: str, overwrite=True, meanwhile=lambda: None, draw=plain_page) -> int:
         def compute(case, *, progress, truth):
             assert truth is None
             progress("working")
@@ -46,6 +47,7 @@ def estimate(tmp_path, monkeypatch, case_result):
         monkeypatch.setattr(study_run, "estimate", compute)
         monkeypatch.setattr(case_report, "render", draw)
         (tmp_path / f"{patient}.toml").write_text(CASE.replace("ID", patient))
+        flags = (*flags, "--overwrite") if overwrite else flags
         return main(["estimate", str(tmp_path / f"{patient}.toml"), "--output", str(tmp_path / "out"), *flags])
 
     return run

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import tomllib
+
+import pytest
 
 from palpate.cli import main
 from palpate.study.case_file import read_case
@@ -67,12 +70,59 @@ def test_an_input_is_not_replaced_by_the_case_with_its_overrides(estimate, out, 
     assert (out / "case.toml").read_bytes() == before
 
 
+def files(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_the_result_of_another_case_is_replaced_only_if_that_is_asked_for(estimate, out, capsys):
+    assert estimate("anna", "--quiet") == 0
+    before, computed = files(out), []
+    assert estimate("bert", overwrite=False, meanwhile=lambda: computed.append(1)) == 2
+    said = capsys.readouterr().err
+    assert f"{out} holds the result of another case, 'anna' (before: " in said
+    assert "this one is 'bert'" in said
+    assert "--overwrite" in said
+    assert (computed, files(out)) == ([], before)
+    assert estimate("bert", "--quiet") == 0
+    assert document(out)["id"] == "bert"
+
+
+def test_the_same_case_after_an_edit_is_run_into_its_folder_again(estimate, out):
+    for flags in ((), ("--set", "seed=3"), ("--set", "mechanics.law=linear")):
+        assert estimate("anna", "--quiet", *flags, overwrite=False) == 0
+    own = (out / "case.toml").read_text().replace('id = "anna"', 'id = "anna-2"').replace('patient = "anna"\n', "")
+    (out / "case.toml").write_text(own)
+    assert main(["estimate", str(out / "case.toml"), "--output", str(out), "--quiet"]) == 0
+
+
+@pytest.mark.parametrize(("moved", "changed", "code"), [(True, False, 0), (False, True, 0), (True, True, 2)])
+def test_another_image_under_the_same_id_is_another_case(estimate, out, tmp_path, capsys, moved, changed, code):
+    image = tmp_path / "before.nii.gz"
+    image.write_bytes(b"one")
+    assert estimate("anna", "--quiet") == 0
+    found = document(out) | {"inputs": {"before": {"sha256": hashlib.sha256(b"one").hexdigest()}}}
+    (out / "result.json").write_text(json.dumps(found))
+    folder = tmp_path / "elsewhere" if moved else tmp_path
+    folder.mkdir(exist_ok=True)
+    (folder / "before.nii.gz").write_bytes(b"two" if changed else b"one")
+    shutil.copy(tmp_path / "anna.toml", folder / "case.toml")
+    assert main(["estimate", str(folder / "case.toml"), "--output", str(out), "--quiet"]) == code
+    assert ("holds the result of another case" in capsys.readouterr().err) == (code == 2)
+
+
+def test_a_run_that_ended_without_values_is_no_result_to_keep(estimate, out):
+    assert estimate("anna", "--quiet") == 0
+    (out / "result.json").write_text(json.dumps(document(out) | {"status": "failed"}))
+    (out / "case.toml").unlink()
+    assert estimate("bert", "--quiet", overwrite=False) == 0
+
+
 def test_a_case_of_somebodys_own_that_says_something_else_is_refused_at_once(estimate, out, capsys):
     out.mkdir()
     (out / "case.toml").write_text("# mine")
     computed = []
     assert estimate("anna", meanwhile=lambda: computed.append(1)) == 2
-    assert "case.toml is another case than that of this run" in capsys.readouterr().err
+    assert "case.toml says something else than the case of this run" in capsys.readouterr().err
     assert not computed
     assert (out / "case.toml").read_text() == "# mine"
 

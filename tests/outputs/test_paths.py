@@ -53,7 +53,7 @@ def test_a_folder_whose_name_is_too_long_ends_with_6(estimate, tmp_path, capsys,
 AS_NOBODY = """
 import os, sys
 from palpate.cli import main
-import palpate.cli.entry, palpate.study.new_case, palpate.study.case_file, scipy.linalg
+import palpate.cli.entry, palpate.steps.display, palpate.study.new_case, palpate.study.case_file, scipy.linalg
 os.getuid() or os.setuid(65534)
 sys.exit(main(sys.argv[1:]))
 """

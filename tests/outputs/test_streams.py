@@ -156,7 +156,7 @@ def test_a_document_that_cannot_be_written_is_told_after_all_else_is_done(ran, r
     folder, _ = ran
     (line,) = (folder / redirections.split("2>")[1]).read_text(encoding="utf-8").strip().splitlines()
     reason = NO_DOCUMENT[redirections]
-    assert f"could not be written to standard output ({reason}); what the run had to write is whole in" in line
+    assert f"could not be written to standard output ({reason}); all files are written in" in line
 
 
 @pytest.mark.parametrize(

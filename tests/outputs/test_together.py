@@ -157,7 +157,7 @@ def test_a_signal_among_the_renames_finds_all_done_and_says_so(estimate, out, ca
 
     assert in_a_child(work) == 130
     (line,) = capfd.readouterr().err.strip().splitlines()
-    assert "interrupted after these files had taken their places: " in line
+    assert "interrupted after these files were written: " in line
     assert "result.json" in line
     assert result(out)["id"] == "bert"
     assert main(["report", str(out), "--quiet"]) == 0
@@ -179,7 +179,7 @@ def test_a_signal_after_the_renames_says_that_they_are_done(estimate, out, capfd
 
     assert in_a_child(work) == 130
     (line,) = capfd.readouterr().err.strip().splitlines()
-    assert "interrupted after these files had taken their places: " in line
+    assert "interrupted after these files were written: " in line
     assert result(out)["id"] == "bert"
 
 
@@ -187,7 +187,7 @@ def test_a_signal_before_the_renames_finds_none_done_and_says_so(estimate, out, 
     assert estimate("anna", "--quiet") == 0
     before = contents(out)
     assert estimate("bert", "--quiet", meanwhile=lambda: os.kill(os.getpid(), signal.SIGHUP)) == 130
-    assert "files that were already there are as they were" in capsys.readouterr().err
+    assert "no file was changed" in capsys.readouterr().err
     assert contents(out) == before
 
 

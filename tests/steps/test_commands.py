@@ -75,7 +75,11 @@ def test_a_mesh_is_made_of_a_case_whatever_its_path_is(folder):
     assert read == palpate.read_case(Path(case.path), ["mesh.edge_length_mm=8"])
     result = palpate.make_mesh(read, progress=told.append)
     assert result.mesh_summary.tets == len(result.space.mesh.tets) > 100
-    assert told[0] == "reading and aligning the images"
+    assert told[0] == "reading the images"
+    roles = "estimate prostate; driver rectum; known body"
+    assert repr(read) == f"<case '{read.id}': before.nii.gz, after.nii.gz; {roles}; neo-hookean>"
+    assert repr(result).startswith(f"<mesh of '{read.id}': {result.mesh_summary.tets:,} tetra".replace(",", " "))
+    assert "\n" not in repr(result)
 
 
 @pytest.mark.parametrize(("module", "name"), [("arviz_stats.base", "arviz-stats"), ("h5netcdf", "h5netcdf")])

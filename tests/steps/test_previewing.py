@@ -12,7 +12,9 @@ from palpate.cli import main
 from palpate.errors import ConfigurationError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
+from palpate.progress import Forecast
 from palpate.report.preview import GENERATOR
+from palpate.study import expected_cost, read_states
 
 NAMES = {"1": "prostate", "2": "rectum", "3": "body"}
 
@@ -52,6 +54,36 @@ def test_a_new_case_is_called_by_its_images_or_their_folder(folder, names, expec
         (folder / f"{name}.nii.gz").rename(image)
     case = palpate.init(*images, labels=folder / "names.json", output=folder / "case")
     assert palpate.read_case(case.path).id == expected
+
+
+def test_init_check_and_estimate_first_predict_the_same_cost(folder):
+    """On the images that they share; a range, which holds what is predicted once the mesh is made."""
+    case = palpate.read_case(new_case(folder).path)
+    page = (folder / "case" / "preview.html").read_text(encoding="utf-8")
+    checked, estimated = list[str](), list[str]()
+    meshed = palpate.check(case, progress=checked.append).cost
+
+    def until_the_forecast(sentence: str) -> None:
+        """Hear what an estimate says up to there."""
+        estimated.append(sentence)
+        if isinstance(sentence, Forecast):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        palpate.estimate(case, progress=until_the_forecast)
+    first = next(sentence for sentence in checked if sentence.startswith("an estimate takes "))
+    assert estimated[-1] == first
+    states = read_states(case)
+    guessed = expected_cost(case, states.before, states.after, n_pairs=1)
+    assert first == guessed.sentence
+    assert f"<dd>{guessed.time_words} on " in page
+    assert f"<dd>{guessed.memory_words}</dd>" in page
+    least, most = guessed.between
+    assert least.unknowns < guessed.unknowns < most.unknowns
+    assert least.seconds < guessed.seconds < most.seconds
+    assert least.memory_gb < guessed.memory_gb < most.memory_gb
+    assert meshed.between is None
+    assert meshed.in_words != guessed.in_words
 
 
 def test_what_init_must_ask_stands_in_the_preview(folder):
@@ -102,3 +134,14 @@ def test_a_case_that_is_refused_has_a_page_without_prediction(folder):
     assert found.exit_code == 3
     assert found.predicted is None
     assert "the problems come first" in (folder / "look.html").read_text(encoding="utf-8")
+
+
+def test_without_a_name_the_page_of_a_check_lies_beside_the_case(tmp_path, capsys):
+    path = tmp_path / "case.toml"
+    path.write_text('[images]\nbefore = "nowhere.nii.gz"\nafter = ["nowhere.nii.gz"]\n')
+    assert main(["check", str(path), "--html"]) > 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"open {tmp_path / 'preview.html'}"
+    assert (tmp_path / "preview.html").is_file()
+    with pytest.raises(SystemExit):
+        main(["check", "--html", str(path)])
+    assert "CASE.TOML; give it before the options" in capsys.readouterr().err

@@ -66,12 +66,22 @@ def test_a_result_is_printed_a_line_a_tissue_with_open_ends_in_words(result):
     assert lines == [
         "prostate: 58.9 kPa (95 %: > 47.1 kPa), identified: high / low is 1.56",
         "bladder: 3.12 x surroundings (95 %: < 5.00), identified: high / low is 1.56",
+        "warning (example): a warning to be shown",
     ]
     lost = str(with_estimates(result, {"interval95": None, "verdict": "not identified"})).splitlines()
     assert lost[0] == "prostate: 58.9 kPa, not identified: high / low is 1.56"
     failed = str(with_estimates(result, status="not converged", reason="it stopped")).splitlines()
     assert failed[0] == "not converged: it stopped"
     assert failed[1].startswith("prostate: no value, not identified: ")
+
+
+def test_the_representation_of_a_result_is_one_line(result):
+    ratio = {"verdict": "ratio only", "ratio": 3.12}
+    assert repr(with_estimates(result, {}, ratio)) == (
+        "<result of 'sub-01': prostate 58.9 kPa, bladder 3.12 x surroundings; 1 warning>"
+    )
+    lost = repr(with_estimates(result, status="not converged", reason="it stopped"))
+    assert lost == "<result of 'sub-01': not converged; prostate no value, bladder no value; 1 warning>"
 
 
 def test_names_in_cards_are_text(result):

@@ -123,3 +123,18 @@ def test_memory_that_will_not_do_is_told_before(case_result, environment, share,
     environment(PALPATE_MEMORY_GB=f"{share * needed.memory_gb:.6f}")
     found = [problem.exit_code for problem in check.memory_problems(needed)]
     assert found == ([] if code is None else [code])
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        ((100.0, 110.0), "about 2 minutes"),
+        ((120.0, 240.0), "2 to 4 minutes"),
+        ((60.0, 120.0), "a minute to 2 minutes"),
+        ((20.0, 60.0), "half a minute to a minute"),
+        ((4000.0, 9000.0), "67 minutes to 2.5 hours"),
+    ],
+)
+def test_a_range_of_times_names_its_unit_once(seconds, words):
+    least, most = (cost.ExpectedCost(1, 1, 1.0, each, "multigrid", 2) for each in seconds)
+    assert dataclasses.replace(least, between=(least, most)).time_words == words

@@ -143,9 +143,9 @@ def test_a_study_goes_on_where_it_was_interrupted(interrupted):
         "law-neo-hookean",
         "outer-boundary-sliding",
     ]
-    assert [line for line in told if line.startswith("variant")] == [
-        "variant 2 of 3: outer boundary sliding",
-        "variant 3 of 3: law neo-hookean",
+    assert [line for line in told if line.startswith("estimate ")] == [
+        "estimate 2 of 3 under another assumption: outer boundary sliding",
+        "estimate 3 of 3 under another assumption: law neo-hookean",
     ]
     written = json.loads((folder / "sensitivity.json").read_text())
     assert set(written["files"]) == {"sensitivity.html"}

@@ -21,6 +21,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from palpate.errors import ResourceError
 from palpate.parallel import processors
+from palpate.progress import Line
 from palpate.study import make_folder, own_file, software_versions, staged, write_json
 
 __all__ = ["Found", "Job", "Ledger", "Part", "Progress", "Scenes", "compute"]
@@ -144,13 +145,13 @@ def compute(jobs: Sequence[Job], ledger: Ledger, *, workers: int, progress: Prog
     left = [Job(keys, job.make) for job in jobs if (keys := tuple(key for key in job.keys if key not in parts))]
     total, count = sum(len(job.keys) for job in jobs), sum(len(job.keys) for job in left)
     if count < total:
-        progress(f"{total - count} of {total} parts are already computed")
+        progress(Line(f"{total - count} of {total} parts are already computed"))
     made = ((key, job.make(key, progress)) for job in left for key in job.keys)
     if min(workers, len(left)) > 1:
         made = _made_by(left, workers, progress)
     for done, (key, part) in enumerate(made, start=total - count + 1):
         parts[key] = ledger.keep(key, part)
-        progress(f"part {done} of {total} done: {key}")
+        progress(Line(f"part {done} of {total} done: {key}"))
     return parts
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from palpate.progress import Line
 from palpate_validation.problems.beads import BEADS_PROBLEMS
 from palpate_validation.problems.concentric import CONCENTRIC_PROBLEMS
 from palpate_validation.problems.contract import Problem, rows_of
@@ -91,7 +92,7 @@ def verification(problems: Sequence[Problem]) -> Scenes[Verification]:
     def rows(name: str, progress: Progress) -> Part:
         """The rows of a problem by its id."""
         place, problem = number[name]
-        progress(f"{name} ({place} of {len(problems)}): {problem.title}")
+        progress(Line(f"{name} ({place} of {len(problems)}): {problem.title}"))
         return rows_of(problem)
 
     def conclude(parts: Mapping[str, Part]) -> Verification:

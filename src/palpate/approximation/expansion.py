@@ -134,16 +134,16 @@ def expansion_around(coarse: FiniteStrainEquilibrium, *, tolerance: float, progr
     tolerance: of the forces, of every equilibrium that follows. Its factorisation is the only one: it serves all solves
     that stay near. Raises `NotConverged` as `coarse_equilibrium` does.
     """
-    progress("finite strain: factorising the tangent stiffness there")
+    progress("finite strain: factorising the tangent stiffness")
     full, moduli, coefficients = coarse.model.to_tolerance(tolerance), coarse.moduli, coarse.coefficients
     try:
         near = coarse.refactorised()
-        progress("finite strain: the equilibrium on it")
+        progress("finite strain: the equilibrium with this factor")
         found = from_start(full, moduli, coefficients, start=near.displacement, nearby=near.factorisation)
-    except SolverError:  # a slender body may be stable at its equilibrium, but not near it
-        progress("finite strain: not stable there, hence the equilibrium first")
+    except SolverError:  # a slender body is stable in equilibrium, and not near it
+        progress("finite strain: the tangent stiffness is not stable; the equilibrium comes first")
         near = from_start(full, moduli, coefficients, start=coarse.displacement, nearby=None).refactorised()
         found = near
-    progress(f"finite strain: derivatives by {len(full.names)} moduli and {len(coefficients)} modes")
+    progress(f"finite strain: derivatives with respect to {len(full.names)} moduli and {len(coefficients)} modes")
     derivatives = FirstOrderModel(full.names, moduli, coefficients, found.values, near.tangent(tolerance=DERIVATIVES))
     return Expansion(derivatives, found, near.counts + near.tangent_counts + found.counts)

@@ -8,18 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 from palpate.cli.outcome import Outcome, columns
 from palpate.errors import ConfigurationError, ResourceError
+from palpate.progress import Line, Progress, counted
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from palpate.cohort.engines.packing import Engine
     from palpate.cohort.records import Record
-    from palpate.progress import Progress
     from palpate.study.outputs import OutputFolder
 
 
-INTERRUPTED = "the plan and the rows that are done, with which --resume goes on"
+INTERRUPTED = "the plan and the finished rows; --resume goes on from there"
 MOST_TOLD = 20  # failed rows
+MOST_NAMED = 5  # rows that are left out for one reason
 TARGETS = ("cohort.csv", "cohort.parquet", "cohort.html", "statistics.json", "plan.json")
 
 
@@ -36,13 +37,14 @@ def cohort(arguments: argparse.Namespace, _: None, outputs: OutputFolder | None,
     from palpate.cohort.run import Options, run_cohort
     from palpate.cohort.table import read_derivatives, read_table
     from palpate.cohort.task import Limits
+    from palpate.images.input_file import like
 
     assert outputs is not None
     table, template = arguments.table, arguments.template
     if table is None:
         raise ConfigurationError("name the cohort's table: palpate cohort cohort.csv --output DIR")
     if template is not None and not template.is_file():
-        raise ConfigurationError(f"there is no template {template}; give the path of a case.toml")
+        raise ConfigurationError(f"there is no template {template}{like(template) or '; give the path of a case.toml'}")
     if table.is_dir():
         rows = read_derivatives(table, template, reference=arguments.reference)
     elif arguments.reference is not None:
@@ -55,6 +57,7 @@ def cohort(arguments: argparse.Namespace, _: None, outputs: OutputFolder | None,
         limits=Limits(arguments.memory_limit, arguments.time_limit),
         resume=arguments.resume,
         only_failed=arguments.only_failed,
+        overwrite=arguments.overwrite,
         workers=arguments.workers,
     )
     try:
@@ -85,10 +88,12 @@ def statistics(_: argparse.Namespace, case: None, outputs: OutputFolder, progres
 
     del case
     plan = read_plan(outputs.path)
-    progress("computing the statistics")
+    progress(Line("computing the statistics"))
     close_cohort(plan, outputs.path)
     document = read_json(outputs.path / "statistics.json")
-    return Outcome(document, f"{_associations(document)}\nwritten to {outputs.path}: {', '.join(TARGETS[:-1])}")
+    files = f"written to {outputs.path}: {', '.join(TARGETS[:-1])}"
+    opening = f"open {outputs.path / 'cohort.html'}"
+    return Outcome(document, "\n".join([_associations(document), *left_out_rows(document), files, opening]))
 
 
 def _engine(arguments: argparse.Namespace, folder: Path) -> Engine:
@@ -108,7 +113,7 @@ def _engine(arguments: argparse.Namespace, folder: Path) -> Engine:
 
 
 def _told(records: Sequence[Record], folder: Path) -> Outcome:
-    """What came of the rows; an exit code above 0 when any of them is still waiting."""
+    """The outcome of the rows; an exit code above 0 when any of them is still waiting."""
     from palpate.study.outputs import read_json
 
     states = [record.state for record in records]
@@ -124,18 +129,37 @@ def _told(records: Sequence[Record], folder: Path) -> Outcome:
     failed = [record for record in records if record.failure_class]
     lines = [f"{record.row.id} failed ({record.failure_class}): {record.message}" for record in failed[:MOST_TOLD]]
     if len(failed) > MOST_TOLD:
-        lines.append(f"and {len(failed) - MOST_TOLD} more, which stand in cohort.csv")
+        lines.append(f"and {len(failed) - MOST_TOLD} more, see cohort.csv")
     summary = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
-    text = "\n".join([*lines, _associations(found), summary, f"written to {folder}: {', '.join(TARGETS[:-1])}, cases/"])
+    files = f"written to {folder}: {', '.join(TARGETS[:-1])}, cases/"
+    opening = f"open {folder / 'cohort.html'}"
+    text = "\n".join([*lines, _associations(found), *left_out_rows(found), summary, files, opening])
     left = f"{counts['waiting']} rows are waiting: --resume goes on with them" if counts["waiting"] else ""
     return Outcome(document, text, ResourceError.exit_code if left else 0, left)
 
 
+def left_out_rows(document: dict[str, Any]) -> list[str]:
+    """The rows that are done and do not enter the statistics, one line for each reason; empty where all enter."""
+    unfit, unknown = dict[str, dict[str, None]](), list[str]()
+    for tissue, organ in document["organs"].items():
+        rows = organ["left_out_rows"]
+        for row, codes in rows["unfit"].items():
+            unfit.setdefault(", ".join(codes), {})[row] = None
+        if rows["not identified"]:
+            unknown.append(_of_rows(rows["not identified"], f"{tissue} is not identified"))
+    return [*(_of_rows(list(rows), codes) for codes, rows in unfit.items()), *unknown]
+
+
+def _of_rows(rows: Sequence[str], reason: str) -> str:
+    more = f" and {len(rows) - MOST_NAMED} more" if len(rows) > MOST_NAMED else ""
+    return f"{counted(len(rows), 'row')} left out: {reason} ({', '.join(rows[:MOST_NAMED])}{more})"
+
+
 def _associations(document: dict[str, Any]) -> str:
-    """What each tissue's modulus has to do with the stage, a line each, and images that patients share."""
+    """How the modulus of each tissue depends on the stage, one line each, and images that patients share."""
     from palpate.report.rows import interval_text, number
 
-    rows = [["tissue", "patients", "scans", "without a value", "factor a stage", "95 %", "p"]]
+    rows = [["tissue", "patients", "scans", "without a value", "factor per stage", "95 %", "p"]]
     for tissue, organ in document["organs"].items():
         found, used = organ["regression"], organ["used"]
         cells = [found.get("undefined", ""), "", ""]

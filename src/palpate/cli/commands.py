@@ -6,18 +6,21 @@ import argparse
 import sys
 import webbrowser
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from palpate.cli.console import tell
-from palpate.cli.outcome import Outcome, columns, listed, warning_lines
+from palpate.cli.outcome import Outcome, columns, listed
 from palpate.errors import ConfigurationError
+from palpate.progress import Line, Progress
+from palpate.steps.streams import tell
+from palpate.steps.warning_lines import warning_lines
 
 if TYPE_CHECKING:
-    from palpate.progress import Progress
     from palpate.study.case import Case
     from palpate.study.outputs import OutputFolder
 
 
+BESIDE = Path()  # the preview of a case lies beside it, under its usual name
 MESH_TARGETS = ("mesh.json", "mesh.vtu", "labels.csv", "labels.nii.gz")
 SURFACE_TARGETS = ("surfaces.nii.gz", "labels.json")
 SIMULATION_TARGETS = ("simulation.json", "mesh.vtu", "labels.csv", "mesh.pvd", "before.nii.gz", "after.nii.gz")
@@ -27,25 +30,29 @@ def init(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress
     """Write a case for images; an earlier case.toml is never replaced."""
     from palpate.steps.previewing import PREVIEW, new_case_with_page
 
-    progress("reading the images")
+    progress(Line("reading the images"))
     case = new_case_with_page(arguments.images, arguments.labels, outputs, cts=arguments.ct, progress=progress)
     rows = [["tissue", "role", "why"]]
     rows += [[tissue.name, str(tissue.role or "?"), tissue.reason] for tissue in case.tissues]
     questions = "".join(f"question: {question}\n" for question in case.questions)
-    page = f"look at {outputs.path / PREVIEW}, " if PREVIEW in outputs.written else ""
-    text = f"{columns(rows)}\n{questions}written to {case.path}; {page}correct it, then: palpate check {case.path}"
+    page = f"\nopen {outputs.path / PREVIEW}" if PREVIEW in outputs.written else ""
+    text = f"{columns(rows)}\n{questions}written to {case.path}: correct it, then: palpate check {case.path}{page}"
     return Outcome(case.to_dict() | {"case": str(case.path)}, text)
 
 
 def check(arguments: argparse.Namespace, _: None, outputs: None, progress: Progress) -> Outcome:
     """List every problem of a case."""
     from palpate.steps import commands
+    from palpate.steps.previewing import PREVIEW
 
     del outputs  # it has no folder
-    found = commands.check(arguments.case_file, arguments.set, html=arguments.html, progress=progress)
+    page = arguments.html
+    if page == BESIDE:
+        page = arguments.case_file.with_name(PREVIEW)
+    found = commands.check(arguments.case_file, arguments.set, html=page, progress=progress)
     refused = "\n".join(problem.message for problem in found.problems if problem.exit_code)
     complaint = refused if arguments.quiet else ""  # what is refused is said even then, as by any other command
-    shown = f"\nwritten to {arguments.html}" if arguments.html else ""
+    shown = f"\nopen {page}" if page else ""
     return Outcome(found.to_dict(), f"{found.text()}{shown}", found.exit_code, complaint)
 
 
@@ -100,7 +107,7 @@ def mesh(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Pro
     from palpate.study.run import make_mesh
 
     result = make_mesh(case, progress=progress)
-    progress("writing the mesh")
+    progress(Line("writing the mesh"))
     document = result.to_dict()
     with outputs.staged() as staging:
         write_mesh_files(result, staging.area)
@@ -120,7 +127,7 @@ def simulate(arguments: argparse.Namespace, case: Case, outputs: OutputFolder, p
     from palpate.study.simulate import simulate as simulated
 
     result = simulated(case, steps=arguments.steps, progress=progress)
-    progress("writing the simulated state")
+    progress(Line("writing the simulated state"))
     document = result.to_dict()
     with outputs.staged() as staging:
         write_simulation_files(result, staging.area)
@@ -137,9 +144,9 @@ def export(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progre
 
     if outputs.same_files([""], [arguments.result]):
         raise ConfigurationError(f"{outputs.path} is the folder of the result itself: choose another --output")
-    progress("reading the result")
+    progress(Line("reading the result"))
     model = read_model(arguments.result)
-    progress(f"writing for {arguments.format}")
+    progress(Line(f"writing the files for {arguments.format}"))
     export_into(outputs, model, arguments.format, Options(arguments.linear, arguments.source))
     document = {"schema": "palpate.export/1", "format": arguments.format, "files": list(outputs.written)}
     return Outcome(document, listed(outputs))
@@ -151,7 +158,7 @@ def view(arguments: argparse.Namespace, _: None, outputs: None, progress: Progre
 
     del outputs  # it writes nothing
     found = viewing(arguments.result)
-    progress("the report is at the address below, for this machine alone; Ctrl-C ends it")
+    progress(Line("the report is at the address below, for this machine alone; Ctrl-C ends it"))
     tell(found.report, sys.stderr)
     if not arguments.no_browser:
         webbrowser.open(found.report)

@@ -7,7 +7,6 @@ words and nothing else.
 from __future__ import annotations
 
 import ctypes
-import errno
 import logging
 import os
 import signal
@@ -21,26 +20,12 @@ from types import FrameType
 from typing import TextIO
 
 from palpate.errors import ConfigurationError, InputDataError
+from palpate.steps.streams import LOGGER, give_up, tell
 from palpate.study.lock import held_folder, own_file
 from palpate.study.outputs import OutputFolder
 
-LOGGER = logging.getLogger("palpate")
 LOGGER.addHandler(logging.NullHandler())  # before there is a log file, messages reach the user as sentences only
 UNLOCKED = "the file system of %s knows no locks: a second run in the folder would not be noticed, so start none there"
-
-
-def tell(text: str, stream: TextIO | None) -> OSError | None:
-    """Print lines on a standard stream; letters that it cannot hold are escaped. Gives why they were not printed."""
-    if stream is None:  # closed from the start
-        return OSError(errno.EBADF, "it is closed")
-    encoding = getattr(stream, "encoding", None) or "utf-8"
-    try:
-        stream.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
-        stream.flush()
-    except (OSError, ValueError) as error:  # ValueError: closed meanwhile
-        give_up(stream)
-        return error if isinstance(error, OSError) else OSError(errno.EBADF, str(error))
-    return None
 
 
 def close_streams() -> None:
@@ -51,14 +36,6 @@ def close_streams() -> None:
                 stream.flush()
         except (OSError, ValueError):
             give_up(stream)
-
-
-def give_up(stream: TextIO) -> None:
-    """What a stream still holds leads nowhere."""
-    with suppress(OSError, ValueError):
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())
-        os.close(nowhere)
 
 
 @contextmanager

@@ -13,11 +13,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from palpate.cli.console import LOGGER, close_log, interruptible, log_is_open, output_folder, tell
+from palpate.cli.console import close_log, interruptible, log_is_open, output_folder
 from palpate.cli.outcome import Outcome, printable_lines
 from palpate.cli.parser import make_parser, version
-from palpate.cli.progress import PATIENCE_S, progress_on_stderr
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
+from palpate.steps.streams import LOGGER, tell
 from palpate.study.outputs import OutputFolder
 
 # Heavy layers are imported by the sub-command that needs them, so that `palpate --help` answers at once.
@@ -29,9 +29,9 @@ LARGEST = 2**31 - 1  # of mallopt
 KEPT = ((-1, LARGEST), (-3, LARGEST), (-8, 1))  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD in bytes, M_ARENA_MAX; malloc.h
 UNEXPECTED = 1
 INTERRUPTED = 130  # as a shell has it
-UNTOUCHED = "interrupted; files that were already there are as they were; the same command starts anew"
-REPLACED = "interrupted after these files had taken their places: {}"
-SPEAKING = "interrupted while its outcome was printed; what it had to write is written"
+UNTOUCHED = "interrupted; no file was changed; give the same command again"
+REPLACED = "interrupted after these files were written: {}"
+SPEAKING = "interrupted while the outcome was printed; all files are written"
 
 
 def run(argv: Sequence[str] | None, signals: Sequence[signal.Signals], mask: Iterable[int]) -> int:
@@ -61,11 +61,11 @@ def run(argv: Sequence[str] | None, signals: Sequence[signal.Signals], mask: Ite
 
 
 def keep_freed_memory() -> bool:
-    """Have the C library keep what arrays leave for the next ones; whether it does.
+    """Tell the C library to keep freed memory for later arrays; whether it accepts that.
 
-    glibc takes every array of more than 32 MB from the system, which fills each page with zeros, and gives it back: on
-    large meshes a fifth of an estimate. One heap for all threads leaves least of it unused. Nothing is changed where
-    the environment tells the library what to do, nor where there is another one.
+    By default glibc requests every array above 32 MB from the system, which fills it with zeros, and returns it after
+    use. This took a fifth of the time on large meshes. One heap for all threads wastes the least memory. Nothing is
+    changed where environment variables set up glibc, or where the C library is another one.
     """
     if "GLIBC_TUNABLES" in os.environ or any(name.startswith("MALLOC_") for name in os.environ):
         return False
@@ -106,6 +106,8 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
 
     `written` gets the names of the files that take their places.
     """
+    from palpate.images.input_file import like
+    from palpate.steps.display import PATIENCE_S, progress_on_stderr
     from palpate.study.case_file import read_case
 
     command: Callable[..., Outcome] = arguments.command
@@ -113,15 +115,20 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
     path: Path | None = None if images else getattr(arguments, "inputs", [getattr(arguments, "case", None)])[0]
     case = None if path is None else read_case(path, arguments.set)
     if arguments.output is None or getattr(arguments, "task", None) is not None:  # a task's folder is another run's
-        with progress_on_stderr(quiet=arguments.quiet) as progress:
+        with progress_on_stderr(quiet=arguments.quiet, verbose=arguments.verbose) as progress:
             return command(arguments, case, None, progress)
     if not arguments.makes_folder and not arguments.output.is_dir():
-        raise InputDataError(f"there is no folder {arguments.output}; name the output folder of an earlier run")
+        advice = like(arguments.output) or "; name the output folder of an earlier run"
+        raise InputDataError(f"there is no folder {arguments.output}{advice}")
     heading = f"palpate {version()}: {' '.join(sys.argv[1:])}"
-    outputs = OutputFolder(arguments.output, written)
+    outputs = OutputFolder(arguments.output, written, getattr(arguments, "overwrite", False))
     with (
         output_folder(outputs, heading, logs=arguments.logs),
-        progress_on_stderr(quiet=arguments.quiet, patience_s=getattr(arguments, "patience_s", PATIENCE_S)) as progress,
+        progress_on_stderr(
+            quiet=arguments.quiet,
+            verbose=arguments.verbose,
+            patience_s=getattr(arguments, "patience_s", PATIENCE_S),
+        ) as progress,
     ):
         outputs.require(arguments.targets)
         _spare_inputs(arguments, case, outputs)
@@ -174,6 +181,6 @@ def _speak(outcome: Outcome, arguments: argparse.Namespace) -> int:
     if refused is None or refused.errno == errno.EPIPE:  # a reader that has left wants no more
         return outcome.exit_code
     reason = refused.strerror or str(refused)
-    where = f"; what the run had to write is whole in {arguments.output}" if arguments.output else ""
+    where = f"; all files are written in {arguments.output}" if arguments.output else ""
     tell(f"palpate: the document of --json could not be written to standard output ({reason}){where}", sys.stderr)
     return outcome.exit_code or ResourceError.exit_code

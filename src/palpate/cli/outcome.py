@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 
 GAP = "  "  # between columns
+PAGES = ("report.html", "sensitivity.html")  # of which the first that was written is to be looked at
 MOST_LETTERS, LEAST_LETTERS = 100, 20  # of a line in a terminal; of a column that is broken
 
 
@@ -38,9 +39,8 @@ def estimates_table(document: Mapping[str, Any]) -> str:
     for item in moduli_in(document):
         interval, ratio = item["interval95"], number(item["ratio"])
         value, unit = number(item["value"]) + (" kPa" if item["value"] is not None else ""), " kPa"
-        if item["verdict"] == "ratio only" and item["value"] is not None:  # whose scale is known within a range
-            value += f" if {item['relative_to']} has {number(item['value'] / item['ratio'])}"
-            interval, unit = item["ratio_interval95"], " (ratio)"
+        if item["verdict"] == "ratio only" and item["ratio"] is not None:  # the scale in kPa is not known well enough
+            value, interval, unit = f"{ratio} x {item['relative_to']}", item["ratio_interval95"], " (ratio)"
         if interval is None and item["ratio_interval95"] is not None:
             interval, unit = item["ratio_interval95"], " (ratio)"
         rows.append(
@@ -62,18 +62,19 @@ def estimates_table(document: Mapping[str, Any]) -> str:
         found, ends = main_numbers(item)
         if found and item["truth"] and (share := expected_share(found, ends, item["truth"])) != NONE:
             error = f"{100.0 * (found / item['truth'] - 1.0):+.0f} %"
-            far.append(f"{item['tissue']} {error} ({share} of such estimates are off as far or further)")
-    more += [f"error, and how often it is as large by the interval: {', '.join(far)}"] if far else []
+            far.append(f"{item['tissue']} {error} ({share} of estimates with this interval are off by as much or more)")
+    more += [f"error against the truth: {', '.join(far)}"] if far else []
     maps = [item["words"] for item in document.get("maps", ())]
     note = [document["note"]] if document.get("note") else []
     return "\n".join([columns(rows), *more, *maps, *note])
 
 
 def listed(outputs: OutputFolder) -> str:
-    """Where the files are that the run has written, and which; those of a sub-folder by its name."""
+    """Where the files are that the run has written, and which; those of a sub-folder by its name; which one to open."""
     names = dict.fromkeys(name.split("/")[0] + ("/" if "/" in name else "") for name in outputs.written)
     log = ["log.txt"] if log_is_open() else []
-    return f"written to {outputs.path}: {', '.join([*names, *log])}"
+    page = next((f"\nopen {outputs.path / name}" for name in PAGES if name in outputs.written), "")
+    return f"written to {outputs.path}: {', '.join([*names, *log])}{page}"
 
 
 def columns(rows: Sequence[Sequence[str]]) -> str:
@@ -89,11 +90,6 @@ def columns(rows: Sequence[Sequence[str]]) -> str:
         cells = zip_longest(*(parts or [""] for parts in broken), fillvalue="")
         lines += [GAP.join(map(str.ljust, parts, widths)).rstrip() for parts in cells]
     return "\n".join(lines)
-
-
-def warning_lines(document: Mapping[str, Any]) -> str:
-    """The document's warnings, a line each with its code; docs/warnings.md tells of all codes."""
-    return "".join(f"warning ({warning['code']}): {warning['message']}\n" for warning in document["warnings"])
 
 
 def printable_lines(text: str) -> str:

@@ -28,7 +28,7 @@ EXAMPLES = {
         "palpate init masks_before/ masks_after/ --output case",
     ),
     "check": (
-        "palpate check case/case.toml --html preview.html",
+        "palpate check case/case.toml --html",
         "palpate check case/case.toml --set mesh.edge_length_mm=6 --json",
     ),
     "noise": (
@@ -99,6 +99,8 @@ class _Parser(argparse.ArgumentParser):
         if mistyped:
             names = re.findall(r"[\w-]+", mistyped[2])
             message = f"there is no command {shown(mistyped[1])}: {nearest(mistyped[1], names)}"
+        if message.endswith("required: CASE.TOML"):  # an option took it
+            message += "; give it before the options"
         super().error(message)
 
 
@@ -118,8 +120,9 @@ def make_parser() -> argparse.ArgumentParser:
         help="print what makes the shell complete commands, flags and files: source it at the shell's start",
     )
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
-    what = "the whole way on the pelvis that Palpate brings along"
+    what = "estimate the example that is installed with Palpate, a pelvis: from images to report"
     demo = _command(subparsers, "demo", written.demo, what=what, folder="palpate-demo")
+    _add_overwrite(demo)
     demo.set_defaults(targets=written.TARGETS)
     _add_preparations(subparsers)
     _add_estimates(subparsers)
@@ -143,33 +146,33 @@ def _add_preparations(subparsers: Any) -> None:
     what = "list every problem of a case without computing"
     check = _command(subparsers, "check", commands.check, what=what, folder=None)
     check.add_argument("case_file", type=Path, metavar="CASE.TOML", help=CASE_HELP)
-    what = "write a page that shows who is who, how the images lie, what is held, and the intervals to expect"
-    check.add_argument("--html", type=Path, metavar="FILE", help=what)
+    what = "write a page with roles, images, boundary and expected intervals; default: preview.html beside the case"
+    check.add_argument("--html", type=Path, nargs="?", const=commands.BESIDE, metavar="FILE", help=what)
     _add_set(check)
-    what = "tell how well surfaces are drawn, from two segmentations of one state: [noise] and [discrepancy] of a case"
+    what = "measure how well surfaces are drawn, on two segmentations of one state: [noise] and [discrepancy] of a case"
     noise = _command(subparsers, "noise", commands.noise, what=what, folder=None)
     noise.add_argument("first", type=Path, metavar="A", help="label image")
     noise.add_argument("second", type=Path, metavar="B", help="the same state again: another scan, reader or program")
     noise.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
-    what = "bring B to A first; default: on all surfaces where their grids differ"
+    what = "move B onto A first; default: by all surfaces, if the grids differ"
     noise.add_argument("--align", choices=("auto", "surfaces", "none"), default="auto", help=what)
-    what = "make a label image of closed surfaces (STL), one an organ, called as its file is"
+    what = "make a label image of closed surfaces (STL), one for each organ, named after its file"
     voxelise = _command(subparsers, "voxelise", commands.voxelise, what=what)
     voxelise.add_argument("surfaces", type=Path, nargs="+", metavar="SURFACE.STL", help="closed surfaces of one state")
     what = "edge of the voxels, mm; default: %(default)s"
     voxelise.add_argument("--spacing", type=_positive, default=1.0, metavar="MM", help=what)
-    what = "how far the image reaches beyond the surfaces, mm; default: %(default)s"
+    what = "margin of the image around the surfaces, mm; default: %(default)s"
     voxelise.add_argument("--margin", type=_positive, default=30.0, metavar="MM", help=what)
-    what = "of files that do not say; default: RAS"
+    what = "axes of the coordinates, for files that do not state them; default: RAS"
     voxelise.add_argument("--axes", choices=("RAS", "LPS"), help=what)
-    what = "millimetres of one unit of the files: 1000 where they are in metres; default: %(default)s"
+    what = "length of one unit of the files in mm: 1000 for metres; default: %(default)s"
     voxelise.add_argument("--scale", type=_positive, default=1.0, metavar="MM", help=what)
-    voxelise.add_argument("--like", type=Path, metavar="IMAGE", help="take this image's grid: the first state's")
+    voxelise.add_argument("--like", type=Path, metavar="IMAGE", help="use the grid of this image, the first state")
     voxelise.set_defaults(targets=commands.SURFACE_TARGETS)
-    mesh = _command(subparsers, "mesh", commands.mesh, what="make the tetrahedra of a case and write them")
+    mesh = _command(subparsers, "mesh", commands.mesh, what="make the tetrahedral mesh of a case and write it")
     _add_case(mesh)
     mesh.set_defaults(targets=commands.MESH_TARGETS)
-    what = "deform the organs of a case with given moduli and write the later state"
+    what = "deform the organs of a case with given moduli, and write the later state"
     simulate = _command(subparsers, "simulate", commands.simulate, what=what)
     _add_case(simulate)
     simulate.add_argument("--steps", type=_count, default=1, metavar="N", help="write N steps to animate")
@@ -189,19 +192,20 @@ def _add_estimates(subparsers: Any) -> None:
     )
     estimate.add_argument("--labels", type=Path, metavar="TABLE", help="label table, with images")
     _add_ct(estimate)
-    what = "first write preview.html, which shows what will be estimated; costs another mesh"
+    what = "first write preview.html, which shows what will be estimated; this makes the mesh twice"
     estimate.add_argument("--preview", action="store_true", help=what)
+    _add_overwrite(estimate)
     estimate.set_defaults(targets=written.TARGETS)
     _add_set(estimate)
-    what = "keep N draws of the moduli's posterior in each of 4 chains, as posterior.nc (extra `samples`)"
+    what = "draw N samples of the posterior of the moduli in each of 4 chains, as posterior.nc (extra `samples`)"
     estimate.add_argument("--samples", type=_samples, action="append", dest="set", default=[], metavar="N", help=what)
-    what = "estimate a case, and each modulus again under changed assumptions; goes on where it was interrupted"
+    what = "estimate a case, then again under changed assumptions; goes on where it was interrupted"
     sensitivity = _command(subparsers, "sensitivity", written.sensitivity, what=what)
     _add_case(sensitivity)
-    what = "also Sobol indices of N samples an input, a power of 2 (extra `sensitivity`)"
+    what = "also compute Sobol indices from N samples of each input, a power of 2 (extra `sensitivity`)"
     sensitivity.add_argument("--sobol", type=_power_of_two, default=0, metavar="N", help=what)
     sensitivity.set_defaults(targets=written.SENSITIVITY_TARGETS)
-    what = "draw report.html of an estimate again"
+    what = "write report.html of an estimate again"
     report = _command(subparsers, "report", written.report, what=what, folder=None)
     report.add_argument("output", type=Path, metavar="DIR", help="the output folder of an estimate")
     report.set_defaults(makes_folder=False, targets=(RESULT, PAGE))
@@ -210,17 +214,17 @@ def _add_estimates(subparsers: Any) -> None:
     export.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
     formats = "; ".join(f"{name}: {form.description}" for name, form in FORMATS.items())
     export.add_argument("--format", required=True, choices=tuple(FORMATS), help=formats)
-    export.add_argument("--linear", action="store_true", help="tetrahedra of four nodes in place of ten")
+    export.add_argument("--linear", action="store_true", help="tetrahedra with four nodes instead of ten")
     export.add_argument("--source", type=Path, metavar="SERIES", help="dicom: the first image's DICOM series")
     export.set_defaults(logs=False)  # which would hold the command with its paths
-    what = "show the report of an estimate and its files in a browser, on this machine alone"
+    what = "show the report of an estimate and its files in a browser, on this machine only"
     view = _command(subparsers, "view", commands.view, what=what, folder=None)
     view.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
     view.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
 
 
 def _add_cohort(subparsers: Any) -> None:
-    what = "estimate many cases, and ask how their moduli go with the stage"
+    what = "estimate many cases, and test how their moduli depend on the stage"
     command = _command(subparsers, "cohort", cohorts.cohort, what=what, folder="palpate-cohort")
     command.add_argument(
         "table",
@@ -229,32 +233,41 @@ def _add_cohort(subparsers: Any) -> None:
         metavar="COHORT",
         help="CSV file: id, patient, session, stage, and case or before and after; or a folder of BIDS derivatives",
     )
-    command.add_argument("--template", type=Path, metavar="CASE.TOML", help="the case that images are put into")
+    command.add_argument("--template", type=Path, metavar="CASE.TOML", help="the case file that is used for all images")
     command.add_argument("--engine", choices=("local", "dask", "slurm"), default="local", help="default: %(default)s")
-    command.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask scheduler that runs, with --engine dask")
-    command.add_argument("--workers", type=_count, metavar="N", help="cases at a time; default: one a processor")
+    command.add_argument("--scheduler", metavar="ADDRESS", help="of a running Dask scheduler, with --engine dask")
+    command.add_argument("--workers", type=_count, metavar="N", help="cases at a time; default: one for each processor")
     command.add_argument("--resume", action="store_true", help="go on with the cohort in the output folder")
-    command.add_argument("--only-failed", action="store_true", help="of that cohort, compute the failed rows again")
+    command.add_argument("--only-failed", action="store_true", help="in that cohort, compute the failed rows again")
+    what = "compute all rows again, in a folder that has a cohort already, this one or another"
+    command.add_argument("--overwrite", action="store_true", help=what)
     command.add_argument(
-        "--memory-limit", type=_positive, metavar="GB", help="of each case; default: by its prediction"
+        "--memory-limit", type=_positive, metavar="GB", help="for each case; default: twice the predicted"
     )
-    command.add_argument("--time-limit", type=_positive, metavar="S", help="of each case; default: by its prediction")
+    command.add_argument(
+        "--time-limit", type=_positive, metavar="S", help="for each case; default: ten times the predicted"
+    )
     command.add_argument("--reference", metavar="SESSION", help="of BIDS derivatives; default: each patient's first")
     command.add_argument("--task", type=int, metavar="N", help="what --engine slurm starts: part N of its job array")
     command.set_defaults(targets=cohorts.TARGETS, patience_s=300.0)
     _add_set(command)
-    what = "say where a cohort stands"
+    what = "count the rows of a cohort that are done, failed and waiting"
     status = _command(subparsers, "status", cohorts.status, what=what, folder=None)
     status.add_argument("folder", type=Path, metavar="DIR", help="the output folder of a cohort")
-    what = "compute the statistics of a cohort again, and draw its page"
+    what = "compute the statistics of a cohort again, and write its page"
     statistics = _command(subparsers, "statistics", cohorts.statistics, what=what, folder=None)
     statistics.add_argument("output", type=Path, metavar="DIR", help="the output folder of a cohort")
     statistics.set_defaults(makes_folder=False, targets=cohorts.TARGETS)
 
 
 def _add_ct(command: argparse.ArgumentParser) -> None:
-    what = "CT of before, or of each image: for the report, and to tell air from tissue in label 0"
+    what = "CT of before, or of each image: for the report, and to find the air in label 0"
     command.add_argument("--ct", type=Path, nargs="+", default=[], metavar="CT", help=what)
+
+
+def _add_overwrite(command: argparse.ArgumentParser) -> None:
+    what = "replace the result of another case in the output folder"
+    command.add_argument("--overwrite", action="store_true", help=what)
 
 
 def _add_case(command: argparse.ArgumentParser) -> None:
@@ -293,6 +306,7 @@ def _command(
         command.add_argument("--output", type=Path, default=Path(folder), metavar="DIR", help="default: %(default)s")
     command.add_argument("--json", action="store_true", help="print one JSON document on stdout, and nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress, no table")
+    command.add_argument("--verbose", action="store_true", help="also print the details of the computation")
     return command
 
 

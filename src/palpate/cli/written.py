@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from palpate.cli.outcome import Outcome, columns, estimates_table, listed, warning_lines
+from palpate.cli.outcome import Outcome, columns, estimates_table, listed
 from palpate.errors import ConfigurationError, EstimationError
+from palpate.progress import Line, Progress
+from palpate.steps.warning_lines import warning_lines
 from palpate.study.outputs import ASIDE, DATA, PAGE, RESULT, RESULT_FILES
 
 if TYPE_CHECKING:
-    from palpate.progress import Progress
     from palpate.study.case import Case
     from palpate.study.outputs import OutputFolder
     from palpate.study.result import CaseResult
@@ -37,13 +38,13 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
     if case is None:
         new = write_new_case(arguments.inputs, arguments.labels, outputs, cts=arguments.ct)
         for tissue in new.tissues:
-            progress(f"{tissue.name}: {tissue.role or '?'}, for {tissue.reason}")
-        progress(f"the case is written to {new.path}")
+            progress(Line(f"{tissue.name}: {tissue.role or '?'}; {tissue.reason}"))
+        progress(Line(f"the case is written to {new.path}"))
         case = read_case(new.path, arguments.set)
     refuse_other_case(case, outputs)
     if arguments.preview:
         write_page(case, outputs, progress=progress)
-        progress(f"the preview is written to {outputs.path / PREVIEW}")
+        progress(Line(f"the preview is written to {outputs.path / PREVIEW}"))
     outputs.require(f"mesh_{number}.vtu" for number in range(2, len(case.pairs) + 2))
     try:
         result = commands.estimate(case, progress=progress)
@@ -53,10 +54,14 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
 
 
 def demo(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: Progress) -> Outcome:
-    """The whole way on the pelvis that Palpate brings along."""
+    """Estimate the example that is installed with Palpate: a pelvis with a simulated later state."""
+    from palpate.demo import DATA as IMAGES
     from palpate.demo import run_demo
+    from palpate.study.case_file import read_case
+    from palpate.study.earlier import refuse_other_case
 
     del case  # it has its own
+    refuse_other_case(read_case(IMAGES / "demo.toml"), outputs)
     return _write_estimate(run_demo(outputs.path, progress), outputs, progress)
 
 
@@ -79,14 +84,14 @@ def report(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: P
     from palpate.study.earlier import strange_files
 
     del case
-    progress("drawing the report")
+    progress(Line("drawing the report"))
     result = redraw_page(outputs)
     files = result["files"]
     path = outputs.path / PAGE
     strange = strange_files(outputs.path, files)
     text = "".join(f"warning: {outputs.path / name} is not of the run that result.json tells of\n" for name in strange)
     document = {"schema": "palpate.report/1", "id": result.get("id"), "report": str(path), "strange_files": strange}
-    return Outcome(document, f"{text}written to {path}")
+    return Outcome(document, f"{text}open {path}")
 
 
 def _write_estimate(result: CaseResult, outputs: OutputFolder, progress: Progress) -> Outcome:

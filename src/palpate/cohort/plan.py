@@ -13,6 +13,7 @@ from pathlib import Path
 from palpate.cohort.resolve import row_key
 from palpate.cohort.task import FAILURE_CLASSES, Limits, Outcome, Row, Task
 from palpate.errors import FolderInUse, InputDataError, ResourceError
+from palpate.images.input_file import like
 from palpate.parallel import mapped
 from palpate.study.lock import held_folder
 from palpate.study.outputs import RESULT, read_json, sha256_of, staged, write_json
@@ -115,7 +116,8 @@ def write_plan(plan: Plan, folder: Path) -> None:
 def read_plan(folder: Path) -> Plan:
     """The plan that `write_plan` wrote; raises `InputDataError` when there is none."""
     if not (folder / PLAN).is_file():
-        raise InputDataError(f"there is no {folder / PLAN}, so no cohort; name the --output folder of palpate cohort")
+        advice = like(folder / PLAN) or "; name the --output folder of palpate cohort"
+        raise InputDataError(f"there is no {folder / PLAN}, so no cohort{advice}")
     content = read_json(folder / PLAN)
     try:
         content.pop("schema")

@@ -1,6 +1,7 @@
-"""cohort.csv and cohort.parquet: a line a row, its state, and value, interval and verdict of every tissue.
+"""cohort.csv and cohort.parquet: one line for each row, with its state, and value, interval, verdict of each tissue.
 
-What is not identified has no number there: its verdict says so.
+What is not identified has no number there: its verdict says so. `used_TISSUE` tells whether the row enters the
+statistics of the tissue, `left_out_TISSUE` why it does not, `warnings` the codes of the warnings of its result.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from palpate.cohort.records import Record, tissues_of
+from palpate.cohort.selection import unit_of, why_left_out
 from palpate.errors import ResourceError
 from palpate.images.named_labels import computed_by_spreadsheets, printable
 from palpate.study.outputs import write_text
 
 CSV, PARQUET = "cohort.csv", "cohort.parquet"
-COLUMNS = ("id", "patient", "session", "stage", "state", "failure_class", "message")
+COLUMNS = ("id", "patient", "session", "stage", "state", "failure_class", "message", "warnings")
 UNITS = {"kPa": "kpa", "ratio": "ratio"}
 ADVICE = "the tables and statistics of a cohort need {}, which is not installed: pip install 'palpate[cohort]'"
 
@@ -33,6 +35,7 @@ def columns_of(records: Sequence[Record]) -> dict[str, list[Any]]:
         "state": [record.state for record in records],
         "failure_class": [record.failure_class or None for record in records],
         "message": [record.message or None for record in records],
+        "warnings": ["; ".join(record.warnings) or None for record in records],
     }
     for tissue in tissues_of(records):
         moduli = [record.modulus(tissue) for record in records]
@@ -44,6 +47,10 @@ def columns_of(records: Sequence[Record]) -> dict[str, list[Any]]:
         for place, end in enumerate(("low95", "high95"), start=1):
             columns[f"{tissue}_{end}"] = [None if modulus is None else modulus.stated[place] for modulus in moduli]
         columns[f"{tissue}_verdict"] = [None if modulus is None else modulus.verdict for modulus in moduli]
+        unit = unit_of(records, tissue)
+        reasons = [why_left_out(record, tissue, unit) for record in records]
+        columns[f"used_{tissue}"] = [not reason for reason in reasons]
+        columns[f"left_out_{tissue}"] = [reason or None for reason in reasons]
     for name in dict.fromkeys(name for record in records for name in record.row.covariates):
         columns.setdefault(name, [record.row.covariates.get(name) for record in records])
     return columns
@@ -77,6 +84,7 @@ def write_parquet(records: Sequence[Record], path: Path) -> None:
     tissues = tuple(f"{tissue}{end}" for tissue in tissues_of(records) for end in numbers)
     types = {name: pyarrow.float64() if name in tissues else pyarrow.string() for name in columns}
     types["stage"] = pyarrow.int64()
+    types |= {f"used_{tissue}": pyarrow.bool_() for tissue in tissues_of(records)}
     schema = pyarrow.schema(list(types.items()))
     try:
         parquet.write_table(pyarrow.table(columns, schema=schema), path)
@@ -88,4 +96,6 @@ def _cell(value: Any) -> str:
     if isinstance(value, str):
         text = printable(value)
         return f"'{text}" if computed_by_spreadsheets(text) else text
+    if isinstance(value, bool):
+        return "true" if value else "false"
     return "" if value is None else repr(value)

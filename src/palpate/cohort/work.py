@@ -58,7 +58,7 @@ def _attempt(task: Task, tell: Tell) -> Outcome:
     folder = Path(task.folder)
     case = case_of(task.row, task.overrides)
     key = row_key(task.row, task.overrides)
-    outputs, expected = OutputFolder(folder), list[float]()
+    outputs, expected = OutputFolder(folder, overwrite=True), list[float]()  # the cohort owns the folder
 
     def condition(cost: ExpectedCost) -> None:
         """Say what the estimate will take, and leave it when that is not there."""

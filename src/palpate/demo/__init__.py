@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from palpate.images import Role, Tissue
-from palpate.progress import Progress
+from palpate.progress import Line, Progress
 from palpate.study import CaseResult, estimate, read_case
 
 __all__ = ["DATA", "FILLING_MM", "LAW", "TISSUES", "TRUTH_EDGE_MM", "run_demo"]
@@ -38,7 +38,7 @@ def run_demo(output: Path, progress: Progress) -> CaseResult:
 
     `output`: the folder where the caller writes the result. The images are part of the package.
     """
-    progress(f"demo: real anatomy, simulated later state; results go to {output}")
+    progress(Line(f"demo: a real anatomy with a simulated later state; the results go to {output}"))
     case = read_case(DATA / "demo.toml")
     truth = {t.name: t.youngs_modulus_kpa for t in TISSUES if t.role is Role.ESTIMATE and t.youngs_modulus_kpa}
     return replace(estimate(case, progress=progress, truth=truth), note=NOTE)

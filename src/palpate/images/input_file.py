@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
 import hashlib
 import io
 import os
 import stat
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from palpate.errors import InputDataError
+from palpate.images.named_labels import printable
 
 CHUNK = 2**20  # bytes
+ALIKE = 0.6  # share of letters that a name has in common with a mistyped one
+MOST_COMPARED = 10_000  # names in a folder
 # O_NONBLOCK: a pipe without a writer does not block
 FLAGS = sum(getattr(os, name, 0) for name in ("O_RDONLY", "O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
 
@@ -57,13 +62,35 @@ class InputFile(io.BufferedReader):
         return self._digested.digest.hexdigest()
 
 
+def like(path: Path) -> str:
+    """A hint where nothing is at `path` and a file or folder beside it has a similar name; else empty.
+
+    It is compared where the path ends to exist: for `caes/case.toml` beside a folder `case` that is `case/case.toml`.
+    """
+    with suppress(OSError, ValueError):  # a folder that may not be read, a zero byte
+        parts = [*reversed(path.parents), path]
+        missing = next((part for part in parts if not os.path.lexists(part)), None)
+        if missing is None:
+            return ""
+        names = sorted(islice((entry.name for entry in os.scandir(missing.parent)), MOST_COMPARED))
+        found = difflib.get_close_matches(missing.name, names, n=1, cutoff=ALIKE)
+        if found:
+            meant = missing.with_name(found[0])
+            whole = meant / path.relative_to(missing)
+            return f", did you mean '{printable(str(whole if whole.exists() else meant))}'?"
+    return ""
+
+
 def open_input(path: Path) -> InputFile:
     """Open the regular file at `path`, links followed; nothing is waited for.
 
     Raises `OSError` when it cannot be opened, or is a folder, a pipe, a socket or a device; `ValueError` for a path
     with a zero byte.
     """
-    descriptor = os.open(path, FLAGS)
+    try:
+        descriptor = os.open(path, FLAGS)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(errno.ENOENT, f"there is no such file{like(Path(path))}", str(path)) from error
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise OSError(errno.EINVAL, "it is a folder, a pipe, a socket or a device, not a file", str(path))
@@ -92,7 +119,8 @@ def whole_input(path: Path, limit: int) -> tuple[bytes, str]:
                 raise InputDataError(f"'{path}' is larger than {limit} bytes; is it another file? Else make it smaller")
             content = file.read(limit)
     except (OSError, ValueError) as error:
-        raise InputDataError(f"'{path}' cannot be read ({error}); check the path") from error
+        reason = getattr(error, "strerror", None) or error
+        raise InputDataError(f"'{path}' cannot be read ({reason}); check the path") from error
     return content, hashlib.sha256(content).hexdigest()
 
 

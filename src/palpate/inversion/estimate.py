@@ -16,7 +16,7 @@ from palpate.inversion.optimise import Bounds, Minimum
 from palpate.inversion.starts import from_starts, informed_start
 from palpate.inversion.trust_region import NEAR, REPORTED, StopRule, minimised
 from palpate.parallel import blas_on_one_thread
-from palpate.progress import Progress, during
+from palpate.progress import Line, Progress, during
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,10 @@ def invert(
         )
     bounds = settings.bounds
     minima, runs, rest = from_starts(problem, settings.centre, settings.every_start, bounds, progress=progress)
-    progress = during("finite strain", progress) if problem.finite_strain else progress
+    if problem.finite_strain:
+        best = minima[0].objective.parameters.in_words(minima[0].minimum.unknowns)
+        progress(Line(f"{best} by the linear law; now at finite strain", "check the law"))
+        progress = during("check the law", progress)
     ends = continued(minima, bounds, rule=rule, progress=progress)
     return concluded(ends, runs, rest, bounds)
 

@@ -105,14 +105,14 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
     if all(state.approximation for state in start.states):
         return begun(start, begin)
     for number, state in enumerate(start.states, start=1):
-        progress(f"responses of the full model at the bounds' middle, state {number} of {len(start.states)}")
+        progress(f"responses of the full model in the middle of the bounds, state {number} of {len(start.states)}")
         system = state.model.system(parameters.moduli(begin))
         found.append(_Responses(system, system.single_responses(tolerance=SNAPSHOT)))
         states.append(replace(state, observed=found[-1].seen(state, np.zeros(state.model.n_modes))))
-    progress("the motion of walls and frame there")
+    progress("the motion of the walls and of the frame at these moduli")
     objective = replace(start, states=tuple(states)).rematched(begin)
     fitted = fit_coefficients(objective, begin)
-    progress("what the images tell of all unknowns there")
+    progress("what the images tell about each unknown")
     for s, (state, q) in enumerate(zip(objective.states, parameters.coefficients(fitted.unknowns), strict=True)):
         found[s] = found[s].with_material(q)
         states[s] = replace(state, observed=found[s].seen(state, q))
@@ -128,7 +128,7 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
     unknowns = np.concatenate([theta, *fit])
     blocks = tuple(b.combined(inverse) for b, (_, inverse) in zip(parameters.blocks, bases, strict=True))
     seen, informed = replace(parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0))), list[LaterState]()
-    progress(f"how the responses to {seen.n_coefficients} unknowns that are seen change with the moduli")
+    progress(f"how the responses to the {seen.n_coefficients} unknowns that the images show change with the moduli")
     for s, (state, q) in enumerate(zip(start.states, seen.coefficients(unknowns), strict=True)):
         of_state = [(b.acts, basis) for b, (basis, _) in zip(parameters.blocks, bases, strict=True) if s in b.states]
         boundary, material = (

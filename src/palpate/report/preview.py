@@ -13,7 +13,6 @@ from palpate.errors import InputDataError
 from palpate.images.checks import VOLUME_CHANGE
 from palpate.images.registration import length_text
 from palpate.images.tissue import Role, Tissue, tissue_colours
-from palpate.progress import about
 from palpate.report.collect import MOST_LATER
 from palpate.report.page import page_scripts, picture_of, policy_of, widths_of
 from palpate.report.payload import payload
@@ -77,8 +76,8 @@ def preview_page(checked: Checked, *, created: str, version: str, no_prediction:
             no_prediction=no_prediction or "There is no prediction.",
             cost=cost
             and {
-                "time": about(cost.seconds),
-                "memory": number(cost.memory_gb, digits=2),
+                "time": cost.time_words,
+                "memory": cost.memory_words,
                 "solver": cost.solver,
                 "tets": cost.tets,
                 "unknowns": cost.unknowns,

@@ -10,7 +10,8 @@ from pathlib import Path
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image
-from palpate.progress import Progress, silent
+from palpate.progress import Line, Wanted
+from palpate.steps.display import shown_in_python
 from palpate.steps.previewing import checked_with_page, new_case_with_page, place_page, refuse_other_page
 from palpate.steps.results import CaseResult, SavedResult
 from palpate.steps.saving import save_sensitivity
@@ -21,9 +22,10 @@ from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase
 from palpate.study.null_pair import NullPair, noise_of_drawings
 from palpate.study.outputs import RESULT, OutputFolder, read_json
-from palpate.study.result import SCHEMA
+from palpate.study.result import SCHEMA, MeshResult, Simulation
 from palpate.study.sensitivity import Kept, Sensitivity
 from palpate.study.sensitivity import sensitivity as vary
+from palpate.study.simulate import simulate as simulated
 from palpate.study.surface_labels import SurfaceLabels, surface_labels
 
 PathLike = str | os.PathLike[str]
@@ -52,23 +54,24 @@ def init(
 
 
 def check(
-    case: Case | PathLike, overrides: Sequence[str] = (), *, html: PathLike | None = None, progress: Progress = silent
+    case: Case | PathLike, overrides: Sequence[str] = (), *, html: PathLike | None = None, progress: Wanted = "auto"
 ) -> CheckReport:
     """Every problem of a case or its file at once, its organs and what an estimate costs, as `palpate check` tells.
 
     overrides: of a file, as for `read_case`; html: where a page is to be written that shows the case, its images and
-    the intervals that may be expected (then they are in the report, too); progress: is called with a sentence at each
-    stage. Raises nothing for a bad case, which is a problem of the report; `ConfigurationError` for overrides of a case
+    the intervals that may be expected (then they are in the report, too); progress: as in `estimate`.
+    Raises nothing for a bad case, which is a problem of the report; `ConfigurationError` for overrides of a case
     that is read, and where `html` is a file that is no preview of ours, `ResourceError` where it cannot be written.
     """
     if isinstance(case, Case) and overrides:
         raise ConfigurationError("overrides are for a case file: palpate.read_case(file, overrides) reads it so")
     source = case if isinstance(case, Case) else Path(case)
-    if html is None:
-        return check_case(source, overrides, progress=progress)
-    refuse_other_page(Path(html))
-    report, page = checked_with_page(source, overrides, progress=progress)
-    place_page(page, Path(html))
+    with shown_in_python(progress) as tell:
+        if html is None:
+            return check_case(source, overrides, progress=tell)
+        refuse_other_page(Path(html))
+        report, page = checked_with_page(source, overrides, progress=tell)
+        place_page(page, Path(html))
     return report
 
 
@@ -90,7 +93,7 @@ def noise(
     *,
     labels: PathLike | None = None,
     align: str = "auto",
-    progress: Progress = silent,
+    progress: Wanted = "auto",
 ) -> NullPair:
     """How well surfaces are drawn, from two segmentations of one state, as `palpate noise` tells.
 
@@ -99,8 +102,9 @@ def noise(
     are the same, or cannot be of one state.
     """
     table = None if labels is None else read_label_table(Path(labels))
-    progress("reading the images")
-    return noise_of_drawings(*(read_label_image(Path(path), names=table) for path in (first, second)), align=align)
+    with shown_in_python(progress) as tell:
+        tell(Line("reading the images"))
+        return noise_of_drawings(*(read_label_image(Path(path), names=table) for path in (first, second)), align=align)
 
 
 def voxelise(
@@ -110,7 +114,7 @@ def voxelise(
     axes: str | None = None,
     scale: float = 1.0,
     like: PathLike | None = None,
-    progress: Progress = silent,
+    progress: Wanted = "auto",
 ) -> SurfaceLabels:
     """The label image of closed surfaces (STL), one an organ, as `palpate voxelise` writes it.
 
@@ -120,9 +124,10 @@ def voxelise(
     """
     grid = None if like is None else read_label_image(Path(like)).grid
     paths = [Path(path) for path in surfaces]
-    return surface_labels(
-        paths, spacing_mm=spacing_mm, margin_mm=margin_mm, axes=axes, scale=scale, like=grid, progress=progress
-    )
+    with shown_in_python(progress) as tell:
+        return surface_labels(
+            paths, spacing_mm=spacing_mm, margin_mm=margin_mm, axes=axes, scale=scale, like=grid, progress=tell
+        )
 
 
 def estimate(
@@ -130,25 +135,50 @@ def estimate(
     *,
     samples: int | None = None,
     truth: Mapping[str, float] | None = None,
-    progress: Progress = silent,
+    progress: Wanted = "auto",
 ) -> CaseResult:
     """The Young's modulus of every `estimate` tissue of a case, with its interval and its verdict.
 
     samples: draws of the moduli's posterior in each of four chains, 100 to 100 000 (extra `samples`), in the place of
     the case's own [estimate] samples; truth: true moduli (kPa) by tissue, to stand beside the estimates of a
-    simulation; a phantom brings its own; progress: is called with a sentence at each stage. Raises as `make_mesh` does,
+    simulation; a phantom brings its own; progress: "auto" shows stages with a bar in a notebook and on a terminal, True
+    everywhere, None or False nowhere; a function is called with each sentence. Raises as `make_mesh` does,
     `ConfigurationError` for another number of samples, `ResourceError` where the libraries for them are not installed,
     and `EstimationError` where there is no result; an iteration that did not converge is a result whose status says so,
     without values.
     """
     if samples is not None:
         case = replace(case, estimate=replace(case.estimate, samples=samples))
-    found = run.estimate(case, progress=progress, truth=truth)
+    with shown_in_python(progress) as tell:
+        found = run.estimate(case, progress=tell, truth=truth)
     return CaseResult(**{field.name: getattr(found, field.name) for field in fields(found)})
 
 
+def make_mesh(case: Case, *, progress: Wanted = "auto") -> MeshResult:
+    """The tetrahedra of a case's reference image, whose quality was checked, as `palpate mesh` makes them.
+
+    progress: as in `estimate`. Raises `InputDataError` for images that cannot be used, `GeometryError` for organs that
+    cannot be meshed, `MeshQualityError` for a mesh that is not fit to compute with.
+    """
+    with shown_in_python(progress) as tell:
+        return run.make_mesh(case, progress=tell)
+
+
+def simulate(case: Case, *, steps: int = 1, progress: Wanted = "auto") -> Simulation:
+    """A later state of a case whose tissues all state their `youngs_modulus_kpa`, under its law, motion and loads.
+
+    The driver moves as in the later image (its wall is fitted together with the organs' surfaces, the moduli held),
+    by [motion] filling_mm, or as in the [phantom]. steps: how many states to give, each in equilibrium at its share
+    of the motion, the last one the whole (of a phantom, shares of its displacement); progress: as in `estimate`.
+    Raises as `make_mesh` does, and `ConfigurationError` when a modulus is missing, `NotConverged` where a
+    finite-strain path ends early.
+    """
+    with shown_in_python(progress) as tell:
+        return simulated(case, steps=steps, progress=tell)
+
+
 def sensitivity(
-    case: Case, *, sobol: int = 0, output: PathLike | None = None, progress: Progress = silent
+    case: Case, *, sobol: int = 0, output: PathLike | None = None, progress: Wanted = "auto"
 ) -> Sensitivity:
     """Each modulus of a case under changed assumptions: constants, segmentation, law, boundary, mesh, alignment, prior.
 
@@ -157,9 +187,10 @@ def sensitivity(
     `estimate` does, and `NotConverged` where the case itself has no estimate.
     """
     if output is None:
-        return vary(case, sobol=sobol, progress=progress)
+        with shown_in_python(progress) as tell:
+            return vary(case, sobol=sobol, progress=tell)
     outputs = OutputFolder(Path(output))
-    with held_folder(outputs.path):
-        found = vary(case, kept=Kept(outputs), sobol=sobol, progress=progress)
+    with held_folder(outputs.path), shown_in_python(progress) as tell:
+        found = vary(case, kept=Kept(outputs), sobol=sobol, progress=tell)
         save_sensitivity(found, outputs)
     return found

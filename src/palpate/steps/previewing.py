@@ -10,7 +10,7 @@ from pathlib import Path
 
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
 from palpate.images.tissue import Role
-from palpate.progress import Progress, silent
+from palpate.progress import Line, Progress, details, silent
 from palpate.report.preview import GENERATOR, preview_page
 from palpate.study.case import Case
 from palpate.study.case_file import toml_key
@@ -43,7 +43,7 @@ def checked_with_page(
             checked = replace(checked, report=replace(checked.report, predicted=predicted))
         except PalpateError as error:
             missing = f"There is no prediction: {error}"
-    progress("drawing the preview")
+    progress(Line("drawing the preview"))
     return checked.report, _page(checked, missing)
 
 
@@ -75,10 +75,10 @@ def new_case_with_page(
             for t in new.tissues
             if t.role is Role.KNOWN and t.youngs_modulus_kpa is None
         ]
-        checked = checked_case(new.path, overrides, progress=progress, meshed=False)
+        checked = checked_case(new.path, overrides, progress=details(progress), meshed=False)
         asked = tuple(Problem("question", question, ConfigurationError.exit_code) for question in new.questions)
         report = replace(checked.report, problems=(*asked, *checked.report.problems))
-        progress("drawing the preview")
+        progress(Line("drawing the preview"))
         page = _page(replace(checked, report=report), NOT_YET)
     except Exception:  # a drawing never costs the case
         LOGGER.exception("the preview could not be drawn")

@@ -13,8 +13,10 @@ from palpate import report
 from palpate.errors import ResourceError
 from palpate.export.notebook import notebook_viewer
 from palpate.images.tissue import Role, Tissue, tissue_colours
-from palpate.report.rows import moduli_in
+from palpate.progress import counted
+from palpate.report.rows import moduli_in, number
 from palpate.steps.saving import save_estimate
+from palpate.steps.warning_lines import warning_lines
 from palpate.study import result
 from palpate.study.earlier import refuse_other_case
 from palpate.study.lock import held_folder
@@ -26,6 +28,14 @@ if TYPE_CHECKING:
 
 
 COLUMNS = ("patient", "id", "stage", "status")
+
+
+def _short(item: Mapping[str, Any]) -> str:
+    """A modulus in a few words."""
+    if item["value"] is not None and item["verdict"] != "ratio only":
+        return f"{item['tissue']} {number(item['value'])} kPa"
+    found = "no value" if item["ratio"] is None else f"{number(item['ratio'])} x {item['relative_to']}"
+    return f"{item['tissue']} {found}"
 
 
 class _Shown:
@@ -76,12 +86,21 @@ class _Shown:
         """
         return report.moduli_figure(self.to_dict(), self.colours)
 
+    def __str__(self) -> str:
+        """Each tissue's value, interval, verdict and why on a line; then the warnings, the most harmful one first."""
+        document = self.to_dict()
+        note = [document["note"]] if document.get("note") else []
+        return "\n".join([report.result_lines(document), *warning_lines(document).splitlines(), *note])
+
     def __repr__(self) -> str:
-        """A line a tissue: value, interval, verdict and why."""
-        return report.result_lines(self.to_dict())
+        """One line: the case, its moduli, and how many warnings there are."""
+        document = self.to_dict()
+        found = ", ".join(map(_short, moduli_in(document)))
+        status = "" if document["status"] == "converged" else f"{document['status']}; "
+        return f"<result of '{document['id']}': {status}{found}; {counted(len(document['warnings']), 'warning')}>"
 
     def _repr_html_(self) -> str:
-        """The verdict of each tissue as a card, for notebooks."""
+        """The verdict of each tissue as a card and the warnings, for notebooks."""
         return report.result_cards(self.to_dict(), self.colours)
 
 
@@ -120,13 +139,14 @@ class CaseResult(_Shown, result.CaseResult):
         """Colour (#rrggbb) of each tissue."""
         return {t.name: colour for t, colour in zip(self.tissues, tissue_colours(self.tissues), strict=True)}
 
-    def save(self, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+    def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> tuple[Path, ...]:
         """Write result.json, report.html, mesh.vtu ... into `folder`, as `palpate estimate` does, all or none of them.
 
-        Gives the paths that were written. Raises `ConfigurationError` where the folder holds another case.toml of
-        somebody's own, `ResourceError` where another run works there or the disk refuses.
+        overwrite: replace the result of another case there. Gives the paths that were written. Raises
+        `ConfigurationError` where the folder holds the result of another case, or a case.toml of somebody's own,
+        `ResourceError` where another run works there or the disk refuses.
         """
-        outputs = OutputFolder(Path(folder))
+        outputs = OutputFolder(Path(folder), overwrite=overwrite)
         with held_folder(outputs.path):
             refuse_other_case(self.case, outputs)
             save_estimate(self, outputs)

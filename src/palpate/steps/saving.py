@@ -11,7 +11,7 @@ from palpate import report
 from palpate.errors import EstimationError, InputDataError, ResourceError
 from palpate.export.case_files import write_estimate_files
 from palpate.findings import Finding, warning_rows
-from palpate.progress import Progress, during, silent
+from palpate.progress import Line, Progress, silent
 from palpate.study.case import Case
 from palpate.study.earlier import earlier_files, stage_case, vouched
 from palpate.study.outputs import DATA, PAGE, RESULT, OutputFolder, Staging, read_json, write_json, write_text
@@ -28,12 +28,10 @@ def save_estimate(result: CaseResult, outputs: OutputFolder, *, progress: Progre
     Where the page cannot be made, a warning of the document says so instead. Raises `ResourceError` where the disk
     refuses.
     """
-    progress = during("report", progress)
-    progress("writing mesh and stiffness map")
+    progress(Line("writing the results and the report"))
     document = result.to_dict()
     with outputs.staged() as staging:
         write_estimate_files(result, staging.area)
-        progress("drawing the report")
         _draw(lambda: report.write_case_report(result, staging.area), staging, document)
         _commit_estimate(staging, result.case, document)
     return document

@@ -31,7 +31,7 @@ from palpate.observation.contract import Imaged, ImagedBody, Observation, OfInst
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.prescribed_motion import FrameMotion, PrescribedMotion, prescribed_motion
 from palpate.observation.registry import observations
-from palpate.progress import Progress
+from palpate.progress import Line, Progress, grouped
 from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
 from palpate.study.cost import ExpectedCost, cost_of_meshes
@@ -94,10 +94,8 @@ def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
     else:
         found = mesh_reference(states.before, states.after, case, progress=progress)
     space = lagrange_space(found.mesh, element)
-    progress(
-        f"{found.quality.tets} tetrahedra, {3 * len(space.points)} unknowns, smallest dihedral angle"
-        f" {found.quality.min_dihedral_deg:.1f} degrees"
-    )
+    progress(Line(f"{grouped(found.quality.tets)} tetrahedra", "mesh"))
+    progress(f"{3 * len(space.points)} unknowns, smallest dihedral angle {found.quality.min_dihedral_deg:.1f} degrees")
     layers = layers_round_organs(found.mesh) if case.discrepancy.layer_sd else ()
     width = observation_width(states.before.grid, *(image.grid for image in states.after))
     body = Body(states, space, found.quality, width, found.edge_length, found.findings, layers=layers)
@@ -169,7 +167,7 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
     imaged = [(r, o) for r, of_body in enumerate(shown) for o in of_body]
     measured = [of for body in bodies for of in body.measured]
     seen = [(r, (*o, *(term for s, term in measured if s == n))) for n, (r, o) in enumerate(imaged, start=1)]
-    progress("assembling one stiffness matrix a tissue")
+    progress("assembling the stiffness matrix of each tissue")
     numbers = np.cumsum([0, *(body.states.n_later for body in bodies)]).tolist()
     pairs = [pair for body, first in zip(bodies, numbers, strict=False) for pair in _models(body, case, first)]
     models = tuple(model for model, _ in pairs)

@@ -208,6 +208,14 @@ class Case:
     estimate: Estimate = Estimate()
     overrides: tuple[str, ...] = field(default=(), compare=False, metadata=rule(unwritten=True))
 
+    def __repr__(self) -> str:
+        """One line: id, images, the tissues of each role, and the law."""
+        given = [self.images.before.name, *(path.name for path in self.images.after)] if self.images else []
+        given += ["a mesh"] if self.body else ["a phantom"] if self.phantom else []
+        roles = dict.fromkeys(tissue.role for tissue in self.tissues)
+        who = [f"{role} {', '.join(t.name for t in self.tissues if t.role is role)}" for role in roles]
+        return f"<case '{self.id}': {'; '.join([', '.join(given), *who, self.mechanics.law])}>"
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "patient", self.patient or self.id)
         refuse_name(self.id, "the case's id")

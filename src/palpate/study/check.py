@@ -24,7 +24,7 @@ from palpate.images.readers import read_intensities
 from palpate.images.registration import Registration, length_text
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
-from palpate.progress import Progress
+from palpate.progress import Line, Progress
 from palpate.study.body import Body, cost_of_bodies, joint_problem, make_body
 from palpate.study.case import Case
 from palpate.study.case_file import read_case
@@ -85,6 +85,10 @@ class CheckReport:
     measured: Mapping[str, str] = field(default_factory=dict)
     predicted: Prediction | None = None
 
+    def __str__(self) -> str:
+        """What `palpate check` prints."""
+        return self.text()
+
     @property
     def exit_code(self) -> int:
         """0, or that of the first problem, with which an estimate would end."""
@@ -124,6 +128,7 @@ class CheckReport:
                 "seconds": round(cost.seconds),
                 "solver": cost.solver,
                 "processors": cost.processors,
+                "meshed": cost.between is None,
             },
             "predicted": self.predicted and self.predicted.to_dict(),
         }
@@ -142,11 +147,7 @@ class CheckReport:
             lines.append(f"alignment: '{name}' {found.in_words} (surfaces then lie apart by, in mm: {kept})")
         lines += [f"{name}: {words}" for name, words in self.measured.items()]
         if self.cost is not None:
-            cost = self.cost
-            lines.append(
-                f"expected: {cost.tets} tetrahedra, {cost.unknowns} unknowns, {cost.memory_gb:.1f} GB,"
-                f" {cost.seconds / 60.0:.1f} min with {cost.solver} on {cost.processors} processor(s)"
-            )
+            lines.append(f"expected: {self.cost.in_words}")
         if self.predicted is not None:
             lines += self.predicted.lines()
         return "\n".join(lines)
@@ -225,7 +226,7 @@ def checked_case(
     else:
         return Checked(CheckReport(source.stem, problems.all()))
     problems.warn((*unit_warnings(case), *load_warnings(case)))
-    progress("reading the images")
+    progress(Line("reading the images"))
     images = problems.attempt(partial(read_case_images, case, progress=progress))
     pairs = _further_problems(problems, case, progress) if images is None else images.pairs
     if not pairs:
@@ -273,6 +274,7 @@ def _cost(
     """
     first = pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs), mesh=first.mesh)
+    progress(Line(cost.sentence))
     if problems.refused or not meshed or lack_of_memory(cost):
         problems.found += memory_problems(cost)
         return cost, ()

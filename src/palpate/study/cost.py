@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import ndimage
@@ -18,23 +18,25 @@ from palpate.mechanics.solvers.registry import expected_of_size
 from palpate.mesh import SizeField, TetMesh
 from palpate.parallel import processors
 from palpate.processes import available_memory, total_memory
-from palpate.progress import STAGES, Stage
+from palpate.progress import STAGES, Stage, about, counted
 from palpate.study.case import Case
 from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of
 
 MEMORY_FACTOR = 1.5  # factor by which the predicted memory may be wrong
 
 LATTICE = 64  # points of the lattice along the longest side, on which edge lengths are summed
-# Fitted to runs of benchmarks/cost.py (docs/command-line.md), between machines that take 110 and 160 s for the demo.
-TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length: 17 in smooth phantoms, 31 in a real pelvis
+# Fitted to stages of the demo on a machine of two cores that takes 80 s for it; slow machines take twice as long.
+TETS_A_CUBE = 19.4  # tetrahedra in a cube of the wanted edge length, before the mesh is made
+TETS_BETWEEN = (17.0, 31.0)  # the same of smooth phantoms and of a real pelvis: what a guess allows for
 UNKNOWNS_A_TET = {"P1": 0.62, "P2": 4.4}
-FIXED_S: Mapping[Stage, float] = {"reading": 5.0, "linear law": 4.0, "intervals": 5.0, "report": 8.0}
-SECONDS_AN_UNKNOWN = 4.6e-4  # beside the solver, with 90 modes a driver, for each later image
-FINITE_STRAIN_S = 4.2e-4  # the same of equilibria and their derivatives at finite strain
-INTERVALS_S = 4.6e-4  # the same of intervals, and of what would change the answer
+FIXED_S: Mapping[Stage, float] = {"read": 5.0, "assemble": 1.0, "search": 3.0, "intervals": 13.0}
+SECONDS_AN_UNKNOWN = 2.4e-4  # beside the solver, with 90 modes a driver, for each later image
+ASSEMBLING = 0.23  # of that: distances to the surfaces and stiffness matrices
+FINITE_STRAIN_S = 3.6e-4  # the same of equilibria and their derivatives at finite strain
+INTERVALS_S = 2.2e-4  # the same of intervals, and of what would change the answer
 FROM_REST = 2  # further passes, each with a linear one, where the state without loads is found with the moduli
 SECONDS_A_DRAW = 0.039  # of the posterior, in four chains, with 90 modes, for each later image
-SECONDS_A_CUT = 2.0e-4  # of meshing, for each tetrahedron and each tissue that is cut out
+SECONDS_A_CUT = 1.0e-4  # of meshing, for each tetrahedron and each tissue that is cut out
 PARALLEL_SHARE = 0.3  # share of the time that more processors shorten
 FIXED_GB = 0.48
 GB_AN_UNKNOWN = 1.7e-5  # beside the factor, with 90 modes
@@ -50,7 +52,8 @@ SERIES = 30  # further right-hand sides beside those of the modes
 class ExpectedCost:
     """Size of the mesh and of the linear systems, peak memory (GB), time (s), and what they were predicted for.
 
-    stages: of the time, what each stage takes (s), in their order.
+    stages: of the time, what each stage takes (s), in their order; the last one with the report; between: the costs of
+    the smallest and of the largest mesh that the images may lead to, None where the mesh is known.
     """
 
     tets: int
@@ -60,6 +63,36 @@ class ExpectedCost:
     solver: str
     processors: int
     stages: Mapping[Stage, float] = field(default_factory=dict)
+    between: tuple[ExpectedCost, ExpectedCost] | None = None
+
+    @property
+    def time_words(self) -> str:
+        """The time in words: "about 2 minutes", before the mesh is known a range."""
+        least, most = (about(each.seconds) for each in self.between or (self, self))
+        if least == most:
+            return f"about {least}"
+        number, _, unit = least.partition(" ")
+        return f"{number if most.endswith(f' {unit}') and unit else least} to {most}"
+
+    @property
+    def memory_words(self) -> str:
+        """The peak memory in words: "2.2 GB", before the mesh is known a range."""
+        least, most = (f"{each.memory_gb:.1f}" for each in self.between or (self, self))
+        return f"{least} GB" if least == most else f"{least} to {most} GB"
+
+    @property
+    def sentence(self) -> str:
+        """Time and memory as every command says them while it works."""
+        words = f"{self.time_words} on {counted(self.processors, 'processor')}"
+        return f"an estimate takes {words}, and {self.memory_words} of memory"
+
+    @property
+    def in_words(self) -> str:
+        """Time, memory and size, as the report of a check has them."""
+        least, most = (str(each.unknowns) for each in self.between or (self, self))
+        unknowns = f"{self.tets} tetrahedra, {most} unknowns" if least == most else f"{least} to {most} unknowns"
+        on = counted(self.processors, "processor")
+        return f"{self.time_words}, {self.memory_words} of memory ({unknowns}, {self.solver} on {on})"
 
 
 def expected_cost(
@@ -68,10 +101,19 @@ def expected_cost(
     """The cost of estimating a case on this machine, from its first pair of images; further pairs cost the same each.
 
     Nothing is meshed: tetrahedra from the sum of 1 / h^3 over the meshed volume, h the mesher's own edge length there,
-    or those of the case's own `mesh`.
+    or those of the case's own `mesh`. Every command that predicts a cost before it meshes has it from here.
     """
-    size = expected_size(case, expected_tets(case, before, after) if mesh is None else len(mesh.tets))
-    return cost_of_meshes(case, before, [size] * n_pairs, n_after=len(after) or case.n_states)
+
+    def of(tets: float) -> ExpectedCost:
+        """On a mesh of so many tetrahedra a pair."""
+        sizes = [expected_size(case, int(tets))] * n_pairs
+        return cost_of_meshes(case, before, sizes, n_after=len(after) or case.n_states)
+
+    if mesh is not None:
+        return of(len(mesh.tets))
+    tets = expected_tets(case, before, after)
+    least, most = (of(tets * each / TETS_A_CUBE) for each in TETS_BETWEEN)
+    return replace(of(tets), between=(least, most))
 
 
 def expected_size(case: Case, tets: int) -> tuple[int, int]:
@@ -99,11 +141,12 @@ def cost_of_meshes(
     for tets, unknowns in meshes:
         _, solving = expected_of_size(unknowns, case.driver.modes + SERIES, solver=solver)
         work = unknowns * modes * max(n_after, 1)
-        took["meshing"] += (case.body is None) * SECONDS_A_CUT * tets * (len(before.tissues) - 1) * shorter
-        took["linear law"] += SECONDS_AN_UNKNOWN * work * shorter + solving.seconds
-        took["finite strain"] += finite * FINITE_STRAIN_S * work * shorter
+        took["mesh"] += (case.body is None) * SECONDS_A_CUT * tets * (len(before.tissues) - 1) * shorter
+        took["assemble"] += ASSEMBLING * SECONDS_AN_UNKNOWN * work * shorter
+        took["search"] += (1.0 - ASSEMBLING) * SECONDS_AN_UNKNOWN * work * shorter + solving.seconds
+        took["check the law"] += finite * FINITE_STRAIN_S * work * shorter
         if case.strained_reference:
-            took["finite strain"] += FROM_REST * (SECONDS_AN_UNKNOWN + FINITE_STRAIN_S) * work * shorter
+            took["check the law"] += FROM_REST * (SECONDS_AN_UNKNOWN + FINITE_STRAIN_S) * work * shorter
         took["intervals"] += INTERVALS_S * work * shorter
         took["intervals"] += SECONDS_A_DRAW * case.estimate.samples * modes * max(n_after, 1)
         gigabytes += GB_AN_UNKNOWN * work + solving.bytes / 1e9

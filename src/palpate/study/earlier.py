@@ -27,6 +27,8 @@ from palpate.study.outputs import (
     sha256_of,
     write_text,
 )
+from palpate.study.result import SCHEMA
+from palpate.study.schema import shortened
 
 CASE_NAME = "case.toml"
 DOCUMENTS = (RESULT, "mesh.json", "simulation.json", "sensitivity.json")  # each lists the files of its run
@@ -35,18 +37,67 @@ FURTHER_MESH = re.compile(r"mesh_\d+\.vtu")
 
 
 def refuse_other_case(case: Case, outputs: OutputFolder) -> None:
-    """Raise `ConfigurationError` where the folder has a case.toml of somebody's own that says something else.
+    """Raise `ConfigurationError` where the folder holds another case: its result, or a case.toml of somebody's own.
 
-    One that this run or an earlier one has written may be replaced.
+    A result may be replaced where its case has the same id, patient and first image, or the folder is to be
+    overwritten. A case.toml may be replaced that this run or an earlier one has written.
     """
+    there = "" if outputs.overwrite else _other_result(case, outputs.path)
+    if there:
+        raise ConfigurationError(
+            f"{outputs.path} holds the result of another case, {there}; this one is"
+            f" {_named(case.id, case.patient, case)}. Choose another output folder, or replace that result with"
+            " --overwrite (in Python: overwrite=True)"
+        )
     path = outputs.path / CASE_NAME
     if CASE_NAME in outputs.written or not path.exists():
         return
     if not _says(path, case) and CASE_NAME not in vouched(outputs.path, RESULT):
         raise ConfigurationError(
-            f"{path} is another case than that of this run, whose own case.toml would come to stand there: choose"
-            " another --output folder, or move that file"
+            f"{path} says something else than the case of this run, and is not replaced: choose another --output"
+            " folder, or move that file"
         )
+
+
+def _other_result(case: Case, folder: Path) -> str:
+    """The case whose values result.json in the folder holds, in words, where it is another one than `case`.
+
+    The same case, edited, is the folder's own case.toml, or has the same id and patient, and a first image at the same
+    place or with the same content.
+    """
+    try:
+        document = read_json(folder / RESULT)
+    except InputDataError:
+        return ""
+    lost = document.get("schema") == SCHEMA and document.get("status") == "converged"
+    if not lost or _says(folder / CASE_NAME, case):
+        return ""
+    try:
+        earlier = read_case(folder / CASE_NAME)
+    except PalpateError:  # it was moved, or is of a later version
+        earlier = None
+    name, patient = (shortened(str(document.get(key))) for key in ("id", "patient"))
+    if (name, patient) == (case.id, case.patient) and _same_image(case, earlier, document):
+        return ""
+    return _named(name, patient, earlier)
+
+
+def _same_image(case: Case, earlier: Case | None, document: Mapping[str, Any]) -> bool:
+    """Whether two cases have the same first image, by its place or content, or nobody can tell."""
+    if earlier is None or earlier.images is None or case.images is None:
+        return True
+    first, inputs = case.images.before, document.get("inputs")
+    if first.resolve() == earlier.images.before.resolve():
+        return True
+    digest = inputs.get("before") if isinstance(inputs, dict) else None
+    return first.is_file() and digest == {"sha256": sha256_of(first)}
+
+
+def _named(name: str, patient: str, case: Case | None) -> str:
+    """A case in a few words: its id, its patient if that is called otherwise, its first image."""
+    of = f" of patient '{patient}'" if patient != name else ""
+    image = f" (before: {case.images.before})" if case is not None and case.images is not None else ""
+    return f"'{name}'{of}{image}"
 
 
 def stage_case(case: Case, staging: Staging) -> tuple[Finding, ...]:

@@ -12,7 +12,7 @@ from palpate.errors import NotConverged
 from palpate.inversion import InverseProblem, Inversion, InversionSettings, StopRule, invert
 from palpate.inversion.trust_region import REPORTED
 from palpate.mechanics.rest_state import unloaded_displacement
-from palpate.progress import Progress, during
+from palpate.progress import Line, Progress, details, during
 from palpate.study.body import Body, joint_problem, strained_body
 from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
@@ -37,15 +37,16 @@ def inverted(
     reference's strain. Starts are those of the last pass. Raises `NotConverged` where this does not settle, or no such
     state is found.
     """
-    linear = during("linear law", progress)
+    linear = during("search", progress)
     if not case.strained_reference:
         return invert(problem, settings, progress=linear, rule=rule)
     found = invert(problem.linear(), settings, progress=linear, rule=rule)
-    there, change = during("finite strain", progress), np.inf
+    there, change = during("check the law", details(progress)), np.inf
+    progress(Line("the reference state without its loads, and the moduli, in turn", "check the law"))
     for number in range(1, PASSES + 1):
         if not found.minimum.converged:
             return found
-        there(f"the reference without its loads, pass {number}")
+        there(f"the reference state without its loads, pass {number}")
         theta, strained = _theta(found), list[Body]()
         parameters, unknowns = found.objective.parameters, found.minimum.unknowns
         for reference, body in enumerate(bodies):

@@ -61,7 +61,7 @@ def mesh_reference(
         if lack:
             raise GeometryError(f"{failure}; a mesh of {edge:g} mm was not tried: {lack}") from failure
         lengths = edge_length_of(finer, before, after) if failure else chosen
-        why = f"for the mesh before was not fit: {failure}" if failure else chosen.in_words
+        why = f"because the mesh before was not fit: {failure}" if failure else chosen.in_words
         progress(f"meshing at {edge:g} mm, {why}")
         try:
             mesh, quality = _fit_mesh(before, anatomy, lengths, progress)
@@ -104,7 +104,7 @@ def _fit_mesh(
             f"the mesher stopped ({error}), most likely for want of memory; make mesh.edge_length_mm larger, or the"
             ' domain smaller (domain.extent = "margin")'
         ) from error
-    progress("measuring the mesh against its gate")
+    progress("checking the quality of the mesh")
     # voxels of each tissue, a layer of the image at a time, by their share inside: exact for a box along the grid
     counts, lengths_mm = np.zeros(len(before.tissues)), anatomy.box.lengths
     size = np.abs(before.grid.affine[:3, :3].T @ anatomy.box.axes.T).sum(axis=0)

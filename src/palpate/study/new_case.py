@@ -21,7 +21,7 @@ from palpate.study.case_file import relative_path, toml_key, toml_text
 from palpate.study.case_tissue import REMAINING
 from palpate.study.earlier import CASE_NAME
 from palpate.study.guess import GuessedTissue, class_names, guess_tissues, movers_of
-from palpate.study.outputs import OutputFolder, read_regular, write_text
+from palpate.study.outputs import ASIDE, OutputFolder, read_regular, write_text
 from palpate.study.proposed_mesh import MARGIN_MM, background_of, proposed_edge, proposed_window
 
 LARGEST_CASE = 1_000_000  # bytes
@@ -79,6 +79,8 @@ def write_new_case(
 ) -> NewCase:
     """Write case.toml for label images (before, after ...), unless it is there and says something else.
 
+    In a folder that is to be overwritten the other one is kept as case.toml.earlier.
+
     Raises `ConfigurationError` when fewer than two images are given, more CTs than images, or another case.toml is in
     the way, else as `new_case` does.
     """
@@ -90,19 +92,23 @@ def write_new_case(
         )
     outputs.require([CASE_NAME])
     case = new_case(CaseImages(images[0], tuple(images[1:]), table, tuple(cts)), outputs.path)
+    aside: tuple[str, ...] = ()
     if case.path.exists():
         try:
             content = read_regular(case.path, most_bytes=LARGEST_CASE)
         except InputDataError:  # too large to be one, say
             content = b""
         if content != case.text.encode("utf-8"):
-            raise ConfigurationError(
-                f"there is a case already, {case.path}, and it is not replaced: estimate it with 'palpate estimate"
-                f" {case.path}', or choose another --output"
-            )
+            if not outputs.overwrite:
+                raise ConfigurationError(
+                    f"there is a case already, {case.path}, and it is not replaced: estimate it with 'palpate estimate"
+                    f" {case.path}', or choose another --output; 'palpate estimate ... --overwrite' takes the new"
+                    f" images and keeps that file as {CASE_NAME}{ASIDE}"
+                )
+            aside = (CASE_NAME,)
     with outputs.staged() as staging:
         write_text(staging.area / CASE_NAME, case.text)
-        staging.commit()
+        staging.commit(aside=aside)
     return case
 
 

@@ -23,6 +23,7 @@ from types import FrameType
 from typing import Any
 
 from palpate.errors import InputDataError, ResourceError
+from palpate.images.input_file import like
 
 Digests = Mapping[str, Mapping[str, str]]  # name of a file in the folder -> {"sha256": hexadecimal}
 
@@ -106,10 +107,14 @@ class Staging:
 
 @dataclass(frozen=True, slots=True)
 class OutputFolder:
-    """A folder that this run holds; `written`: the names of what this run has put in place there."""
+    """A folder that this run holds; `written`: the names of what this run has put in place there.
+
+    overwrite: whether the result of another case there may be replaced.
+    """
 
     path: Path
     written: list[str] = field(default_factory=list)
+    overwrite: bool = False
 
     def require(self, names: Iterable[str]) -> None:
         """Raise `ResourceError` where one of the files `names` could not be put in place; before they are computed."""
@@ -322,7 +327,8 @@ def read_regular(path: Path, *, most_bytes: int) -> bytes:
                 raise InputDataError(f"{path} has {status.st_size} bytes, more than Palpate writes; estimate again")
             return stream.read(most_bytes)
     except FileNotFoundError as error:
-        raise InputDataError(f"there is no {path}; run the estimate first, which writes it") from error
+        advice = like(path) or "; run the estimate first, which writes it"
+        raise InputDataError(f"there is no {path}{advice}") from error
     except OSError as error:
         raise InputDataError(
             f"cannot read {path}: {error.strerror or error}; is this the output folder of an estimate?"

@@ -10,7 +10,7 @@ import numpy as np
 
 from palpate.inversion import first_noise_of, fit_coefficients
 from palpate.parallel import blas_on_one_thread
-from palpate.progress import Progress
+from palpate.progress import Line, Progress
 from palpate.study.body import Body, joint_problem, on_linear_elements
 from palpate.study.case import Case, Mechanics
 from palpate.study.run import inversion_settings
@@ -99,7 +99,7 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
     settings = inversion_settings(coarse, problem.parameters)
     objective, nearby = first_noise_of(problem, settings, progress=progress)
     noise_of = error_noise(nearby.evaluation)
-    progress("the information of the images at the guessed moduli")
+    progress(Line("predicting the intervals from the images, at guessed moduli"))
     guess, stated = nearby.unknowns.copy(), {tissue.name: tissue.modulus_kpa for tissue in case.tissues}
     guess[: objective.n_parameters] = settings.centre
     for i, name in enumerate(objective.parameters.tissues):

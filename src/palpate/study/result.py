@@ -19,6 +19,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.quality import MeshQuality
 from palpate.mesh.space import LagrangeSpace
+from palpate.progress import counted, grouped
 from palpate.study.case import Case
 from palpate.study.case_file import case_tables
 from palpate.study.case_tissue import CaseTissue
@@ -232,6 +233,11 @@ class MeshResult:
     provenance: Provenance
     remarks: tuple[Finding, ...] = ()
 
+    def __repr__(self) -> str:
+        """One line."""
+        found = self.mesh_summary
+        return f"<mesh of '{self.case.id}': {grouped(found.tets)} tetrahedra, {counted(found.dofs, 'unknown')}>"
+
     def to_dict(self) -> dict[str, Any]:
         """A JSON document, schema palpate.mesh/1."""
         document = {"schema": "palpate.mesh/1", "id": self.case.id, "mesh": _plain(self.mesh_summary)}
@@ -255,6 +261,12 @@ class Simulation:
     moduli_kpa: Mapping[str, float]
     provenance: Provenance
     remarks: tuple[Finding, ...] = ()
+
+    def __repr__(self) -> str:
+        """One line."""
+        largest = float(np.linalg.norm(self.displacements[-1], axis=1).max())
+        steps = counted(len(self.displacements), "step")
+        return f"<simulation of '{self.case.id}': {steps}, largest displacement {largest:.2f} mm>"
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON document, schema palpate.simulation/1."""

@@ -15,7 +15,7 @@ from palpate.inversion import Bounds, Inversion, InversionSettings
 from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
-from palpate.progress import Forecast, Progress, about, during, silent
+from palpate.progress import Forecast, Line, Progress, counted, during, silent
 from palpate.study.body import Body, cost_of_bodies, joint_problem, make_body
 from palpate.study.case import SOUGHT_RATIOS, Case, Mechanics
 from palpate.study.case_body import LAW_NAMES
@@ -53,9 +53,10 @@ def estimate(
     iteration that did not converge is no error but a result whose status says so, with no values.
     """
     began = time.perf_counter()
-    reading = during("reading", progress)
+    reading = during("read", progress)
     reading("reading and aligning the images")
     images = read_case_images(case, progress=reading)
+    progress(Line(_in_words(images.pairs), "read"))
     states, *further = images.pairs
     cost = expected_cost(case, states.before, states.after, n_pairs=len(images.pairs), mesh=states.mesh)
     refuse_lack(cost)
@@ -86,16 +87,21 @@ def estimate_states(
     body, each with its own reference state, which are meshed on their own and share the moduli.
     """
     clock = [time.perf_counter()]
-    bodies = tuple(make_body(pair, case, progress=during("meshing", progress)) for pair in (states, *further))
+    bodies = tuple(make_body(pair, case, progress=during("mesh", progress)) for pair in (states, *further))
     body = bodies[0]
     cost = cost_of_bodies(bodies, case)
     refuse_lack(cost)
     progress(_forecast(cost))
     clock.append(time.perf_counter())
-    problem = joint_problem(bodies, case, progress=during("linear law", progress))
+    progress(Line(f"the equations of {counted(cost.unknowns, 'unknown')}", "assemble"))
+    problem = joint_problem(bodies, case, progress=during("assemble", progress))
     clock.append(time.perf_counter())
     settings = inversion_settings(case, problem.parameters)
+    later = "later image" if len(problem.states) == 1 else "later images"
+    progress(Line(f"the moduli that explain the {later}, from {counted(len(settings.every_start), 'start')}", "search"))
     inversion = inverted(bodies, problem, case, settings, progress=progress)
+    best = inversion.objective.parameters.in_words(inversion.minimum.unknowns)
+    progress(Line(f"best fit: {best}; how far can it be off?", "intervals"))
     stating = during("intervals", progress)
     estimation = conclude(
         inversion,
@@ -107,7 +113,7 @@ def estimate_states(
         progress=stating,
     )
     if inversion.minimum.converged:
-        stating("what would change the answer: surfaces, constants, frame and law by a step each")
+        stating("what would change the answer: surfaces, constants, frame and law, one after the other")
         estimation = replace(estimation, variations=_what_would_change(inversion, settings, case, bodies))
     clock.append(time.perf_counter())
     stages = np.diff(clock)
@@ -132,13 +138,9 @@ def estimate_states(
 
 
 def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
-    """The tetrahedra of a case's reference image, passed through the gate on their quality, as `palpate mesh` has them.
-
-    progress: is called with a sentence at each stage. Raises `InputDataError` for images that cannot be used,
-    `GeometryError` for organs that cannot be meshed, `MeshQualityError` for a mesh that fails its gate.
-    """
+    """The tetrahedra of a case's reference image, as `palpate.make_mesh` gives them; raises as that does."""
     began = time.perf_counter()
-    progress("reading and aligning the images")
+    progress(Line("reading the images"))
     states = read_states(case, progress=progress)
     inputs = input_digests(case, states.inputs)
     body = make_body(states, case, progress=progress)
@@ -172,8 +174,15 @@ def _what_would_change(
 
 
 def _forecast(cost: ExpectedCost) -> Forecast:
-    words = f"about {about(cost.seconds)}, as predicted for {cost.unknowns} unknowns on {cost.processors} processor(s)"
-    return Forecast(words, cost.stages)
+    return Forecast(cost.sentence, cost.stages)
+
+
+def _in_words(pairs: Sequence[ImagedStates]) -> str:
+    """What was read of a case."""
+    tissues = counted(len(pairs[0].before.tissues), "tissue")
+    if pairs[0].mesh is not None:
+        return f"a mesh with {tissues}"
+    return f"{counted(sum(1 + len(pair.after) for pair in pairs), 'image')} with {tissues}"
 
 
 def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSettings:

@@ -30,7 +30,7 @@ from palpate.images.tissue import Role
 from palpate.inversion import Inversion, InversionSettings, StopRule
 from palpate.mechanics.dilatation import choose_element
 from palpate.parallel import blas_on_one_thread
-from palpate.progress import Progress, silent
+from palpate.progress import Line, Progress, counted, details, silent
 from palpate.study.body import Body, joint_problem, make_body
 from palpate.study.case import Case
 from palpate.study.case_body import LAW_NAMES
@@ -135,10 +135,10 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
         )
     if sobol:
         require_salib()
-    progress("reading the images")
+    progress(Line("reading the images"))
     images = read_case_images(case, progress=progress)
     key = kept_under(case, images.inputs)
-    bodies = cache(lambda: _meshed(images, case, progress))
+    bodies = cache(lambda: _meshed(images, case, details(progress)))
     base = kept.get(f"estimate-sobol-{sobol}", key)
     if base is None:
         base = json_object(_estimated(case, bodies(), sobol, progress))
@@ -150,8 +150,9 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
     for number, variant in enumerate(variants, start=1):
         part = kept.get(variant.name, key)
         if part is None:
-            progress(f"variant {number} of {len(variants)}: {variant.cause.replace('_', ' ')} {variant.setting}")
-            found = _varied(variant, images, bodies, base, progress)
+            what = f"{variant.cause.replace('_', ' ')} {variant.setting}"
+            progress(Line(f"estimate {number} of {len(variants)} under another assumption: {what}"))
+            found = _varied(variant, images, bodies, base, details(progress))
             part = json_object(asdict(found))
             kept.put(variant.name, key, part)
         variations.append(Variation(**{name: value for name, value in part.items() if name != "key"}))
@@ -191,7 +192,8 @@ def _inverted(
 
 def _estimated(case: Case, bodies: Bodies, sobol: int, progress: Progress) -> dict[str, Any]:
     """The case as it is, and all that is found on the fast path around it."""
-    inversion, settings = _inverted(bodies, case, progress)
+    progress(Line("estimating the case as it is"))
+    inversion, settings = _inverted(bodies, case, details(progress))
     if not inversion.minimum.converged:
         raise NotConverged(
             f"the case itself has no estimate ({inversion.minimum.outcome.value}), so nothing can be said of what it"
@@ -199,17 +201,17 @@ def _estimated(case: Case, bodies: Bodies, sobol: int, progress: Progress) -> di
         )
     later = tuple(image for body in bodies for image in body.states.after)
     observed = observed_of(inversion, bodies)
-    estimation = conclude(inversion, settings, observed, truth={}, seed=case.seed, progress=progress)
+    estimation = conclude(inversion, settings, observed, truth={}, seed=case.seed, progress=details(progress))
     given: dict[str, Any] = {
         "dilatation": choose_element(case.mechanics.element).dilatation,
         "voxel_mm": voxel_mm(later),
     }
     tissues = bodies[0].space.mesh.tissues
-    progress("constants, surfaces, modes and prior changed on the fast path")
+    progress(Line("changing constants, surfaces, modes and priors, one after the other"))
     variations = fast_variations(inversion, settings, tissues, **given)
     indices = None
     if sobol:
-        progress(f"Sobol indices: {sobol} samples an input")
+        progress(Line(f"Sobol indices: {counted(sobol, 'sample')} of each input"))
         indices = asdict(sobol_result(inversion, settings, tissues, n=sobol, seed=case.seed, **given))
     return {
         "estimates": [{name: getattr(item, name) for name in BASE} for item in estimation.estimates],

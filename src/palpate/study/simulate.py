@@ -24,7 +24,7 @@ from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.motion import wall_filling
-from palpate.progress import Progress, silent
+from palpate.progress import Line, Progress, silent
 from palpate.study.body import Body, inverse_problem, make_body, strained_body
 from palpate.study.case import Case, Mechanics
 from palpate.study.case_loads import case_loads
@@ -35,14 +35,7 @@ from palpate.study.result import MeshSummary, Provenance, Simulation
 
 
 def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simulation:
-    """A later state of a case whose tissues all state their `youngs_modulus_kpa`, under its law, motion and loads.
-
-    The driver moves as in the later image (its wall is fitted together with the organs' surfaces, the moduli held),
-    by [motion] filling_mm, or as in the [phantom]. steps: how many states to give, each in equilibrium at its share
-    of the motion, the last one the whole (of a phantom, shares of its displacement); progress: is called with a
-    sentence at each stage. Raises as `make_mesh` does, and `ConfigurationError` when a modulus is missing,
-    `NotConverged` where a finite-strain path ends early.
-    """
+    """The later states of a case, as `palpate.simulate` gives them; raises as that does."""
     began = time.perf_counter()
     inputs: Mapping[str, str] = {}
     if case.phantom is not None:
@@ -52,14 +45,14 @@ def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simu
         summary = MeshSummary.of(mesh_figures(space.mesh), space)
         displacements = tuple(scene.displacement * (step / steps) for step in range(1, steps + 1))
     else:
-        progress("reading and aligning the images")
+        progress(Line("reading the images"))
         states = read_states(case, progress=progress)
         inputs = input_digests(case, states.inputs)
         tissues = states.before.tissues
         _refuse_unknown(tissues)
         body = make_body(states, case, progress=progress)
         space, summary = body.space, MeshSummary.of(body.quality, body.space, body.edge_length)
-        progress("solving for the displacement")
+        progress(Line("solving for the displacement"))
         shares = [step / steps for step in range(1, steps + 1)]
         if case.motion is None and states.after:
             problem = inverse_problem(body, case, progress=progress)

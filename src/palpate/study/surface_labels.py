@@ -19,7 +19,7 @@ from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.named_labels import NamedLabel
 from palpate.images.readers.merged_masks import Mask, merged
 from palpate.images.readers.stl import SurfaceFile, read_stl
-from palpate.progress import Progress, silent
+from palpate.progress import Line, Progress, silent
 
 MOST_VOXELS = 2**28
 MOST_SURFACES = 500
@@ -96,7 +96,7 @@ def surface_labels(
 
     def masks() -> Iterator[Mask]:
         for name, surface in surfaces.items():
-            progress(f"surface {names[name]} of {len(surfaces)}: {name}")
+            progress(Line(f"surface {names[name]} of {len(surfaces)}: {name}"))
             inside = _inside(surface, grid)
             count = int(np.count_nonzero(inside))
             volumes[name] = (surface.held_mm3, count * grid.voxel_volume)

@@ -22,7 +22,7 @@ from palpate.cohort.resolve import case_of
 from palpate.cohort.task import LEAST_MEMORY_GB, Outcome, Task
 from palpate.errors import InputDataError, PalpateError, ResourceError
 from palpate.parallel import mapped
-from palpate.progress import Progress
+from palpate.progress import Line, Progress
 from palpate.study.cost import expected_cost
 from palpate.study.outputs import read_json, staged, write_json, write_text
 from palpate.study.read import read_states
@@ -135,7 +135,7 @@ def run_part(folder: Path, number: int, progress: Progress) -> list[Outcome]:
     left = [task for task, mark in zip(tasks, marks, strict=True) if mark is None or mark.key != task.key]
     outcomes = []
     for outcome in LocalEngine(1).outcomes(left):
-        progress(f"{outcome.id}: {outcome.state} {outcome.message}")
+        progress(Line(f"{outcome.id}: {outcome.state} {outcome.message}"))
         outcomes.append(outcome)
     return outcomes
 

@@ -14,11 +14,10 @@ from scipy import stats
 from statsmodels.stats.meta_analysis import combine_effects
 
 from palpate.cohort.records import Record
-from palpate.findings import Misleading
+from palpate.cohort.selection import NOTHING_KNOWN, OTHER_UNIT, UNFIT, unfit_codes, unit_of, why_left_out
 from palpate.uncertainty import NORMAL_95
 from palpate.uncertainty.intervals import within_subject_cv
 
-UNFIT: tuple[Misleading, ...] = ("mirrored", "voxel-size", "units", "large-shift", "volume-implausible", "fold-over")
 RULES = (
     "A scan enters when its row is done. One that is not identified has no value: it enters as censored, by its ends.",
     "Of a scan that is not identified and has no end, nothing is known: it is left out, counted and named.",
@@ -105,17 +104,16 @@ class Usable:
 def usable_scans(records: Sequence[Record], tissue: str) -> Usable:
     """The scans of a tissue that enter by `RULES`; where rows in kPa and ratios are mixed, those in kPa."""
     found = [(record, modulus) for record in records if (modulus := record.modulus(tissue)) is not None]
-    unit = "kPa" if any(modulus.unit == "kPa" for _, modulus in found) else "ratio"
-    wrong: frozenset[str] = frozenset(UNFIT)
+    unit = unit_of(records, tissue)
     scans, unfit, unknown, other = list[Scan](), dict[str, list[str]](), list[str](), 0
     for record, modulus in found:
-        row, codes = record.row, [code for code in record.warnings if code in wrong]
-        if modulus.unit != unit:
+        row, why = record.row, why_left_out(record, tissue, unit)
+        if why == OTHER_UNIT:
             other += 1
-        elif codes:
-            unfit[row.id] = codes
-        elif not (modulus.low95 or modulus.high95):
+        elif why == NOTHING_KNOWN:
             unknown.append(row.id)
+        elif why:
+            unfit[row.id] = unfit_codes(record)
         else:
             who, ends = (row.id, row.patient, row.session, row.stage), (modulus.low95, modulus.high95)
             value = modulus.value if all(modulus.stated) else None

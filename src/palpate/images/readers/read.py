@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError, ResourceError
+from palpate.images.input_file import like
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.named_labels import LabelTable, checked_table
 from palpate.images.readers.isolation import ReadLimits, read_stored
@@ -58,6 +60,8 @@ def read_intensities(
 
 def _read(path: Path, kind: str, limits: ReadLimits | None, grid: VoxelGrid | None = None) -> StoredImage:
     """The image in the order closest to RAS; `kind`: what its values are, "labels" or "intensities"."""
+    if not path.suffix and not os.path.lexists(path):  # a folder of masks
+        _check_file(path)
     image_format = format_of(path)
     if FOLDER not in image_format.endings:
         _check_file(path)
@@ -79,8 +83,8 @@ def _check_file(path: Path) -> None:
     try:
         found = path.stat()
     except FileNotFoundError as error:
-        advice = "check the path, which in a case file or cohort table begins at that file"
-        raise InputDataError(f"there is no file '{path}'; {advice}, and whether it was moved since") from error
+        advice = "; check the path, which in a case file or cohort table begins at that file, and whether it was moved"
+        raise InputDataError(f"there is no file '{path}'{like(path) or advice}") from error
     except (OSError, ValueError) as error:
         flaw = f"'{path}' cannot be opened ({error})"
         raise InputDataError(f"{flaw}; check the path and your right to read it") from error

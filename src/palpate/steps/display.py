@@ -1,4 +1,4 @@
-"""Where a run talks while it works: sentences on stderr, and on a terminal a bar below them.
+"""What a person sees while a run works: a line for each stage and, on a terminal or in a notebook, a bar below them.
 
 The bar tells the stage, the share that is done and the time that is left, as `palpate check` predicts it. It never runs
 backwards and is never full: its share is that of the stages that are over, and of the present one as far as time tells.
@@ -6,6 +6,7 @@ backwards and is never full: its share is that of the stages that are over, and 
 
 from __future__ import annotations
 
+import html
 import math
 import os
 import signal
@@ -14,23 +15,25 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TextIO, cast
+from importlib import import_module
+from typing import Any, TextIO, cast
 
-from palpate.cli.console import LOGGER, give_up, tell
+from rich.console import Console
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+
 from palpate.images.named_labels import printable
-from palpate.progress import Forecast, Progress, Stage, Told, about
-
-if TYPE_CHECKING:
-    from rich.live import Live
-    from rich.table import Table
-
+from palpate.progress import Forecast, Line, Progress, Stage, Told, Wanted, about, silent
+from palpate.steps.streams import LOGGER, give_up, tell
 
 TRUST = 0.1  # of the predicted time: how much of it must be over before its own pace outweighs the prediction
 STEADY = 0.75  # of a stage: beyond, its share creeps, as nobody knows how much longer it takes
 MOST = 0.99
-PATIENCE_S = 8.0
+PATIENCE_S = 30.0  # without a line, where no bar moves
+REDRAWN_S = 1.0  # in a notebook
 WIDTH = 32
 INDENT = 11  # of what follows the time
 
@@ -63,12 +66,41 @@ def place(seconds: Mapping[Stage, float], begun: Mapping[Stage, float], now: flo
     return Place(stage, min(there / total, MOST), max(pace, slower) * (total - there))
 
 
-@contextmanager
-def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterator[Progress]:
-    """While the block works, what takes its sentences: each goes to the log, and with the seconds so far to stderr.
+def shown_in_python(wanted: Wanted) -> AbstractContextManager[Progress]:
+    """While the block works, what takes the sentences of a function that was called from Python.
 
-    Where no bar moves there, a line follows every `patience_s` seconds without a sentence: a library that factorises or
-    remeshes says nothing while it works.
+    wanted: a function that is called with each sentence; "auto": lines and a bar in a notebook or on a terminal, and
+    nothing elsewhere; True: lines on stderr there, too; False or None: nothing.
+    """
+    if callable(wanted):
+        return nullcontext(wanted)
+    if not wanted:
+        return nullcontext(silent)
+    if _in_notebook():
+        return progress_in_notebook()
+    return nullcontext(silent) if wanted == "auto" and not _is_terminal(sys.stderr) else progress_on_stderr()
+
+
+def _is_terminal(stream: TextIO | None) -> bool:
+    try:
+        return stream is not None and stream.isatty()
+    except ValueError:  # closed
+        return False
+
+
+def _in_notebook() -> bool:
+    ipython = sys.modules.get("IPython")  # a notebook has loaded it
+    return ipython is not None and getattr(ipython.get_ipython(), "kernel", None) is not None
+
+
+@contextmanager
+def progress_on_stderr(
+    *, quiet: bool = False, verbose: bool = False, patience_s: float = PATIENCE_S
+) -> Iterator[Progress]:
+    """While the block works, what takes its sentences: all go to the log, lines with the seconds so far to stderr.
+
+    verbose: details go there, too. Where no bar moves, a line follows every `patience_s` seconds without another: what
+    it is that takes so long, and how far it is.
     """
     bar, began = Bar(), time.monotonic()
     said: list[tuple[str, float]] = []
@@ -76,20 +108,20 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
     def progress(sentence: str) -> None:
         """Tell what happens now."""
         LOGGER.info(sentence)
-        said.append((sentence, time.monotonic()))
-        if not quiet:
-            bar.tell(sentence, fitted(f"[{time.monotonic() - began:6.1f} s] {printable(sentence)}", sys.stderr))
+        new = bar.hear(sentence)
+        if not quiet and (new or verbose):
+            said.append((sentence, time.monotonic()))
+            bar.show(fitted(f"{_clock(began)} {printable(sentence)}", sys.stderr))
 
     def remind(over: threading.Event) -> None:
-        """Say that the last thing still goes on."""
+        """Say that it still goes on."""
         reminded = began
         while not over.wait(0.1 * patience_s):
             sentence, since = said[-1] if said else ("starting", began)
             now = time.monotonic()
             if now - max(since, reminded) > patience_s and not bar.moves:
                 reminded = now
-                words = f"[{now - began:6.1f} s] still, after {now - since:.0f} s: {printable(sentence)}"
-                tell(fitted(words, stream), stream)
+                tell(fitted(f"{_clock(began)} still at work: {bar.where() or printable(sentence)}", stream), stream)
 
     # a stream to the same place, which stays open while a library's own words on standard error are sent nowhere
     stream: TextIO | None = None if quiet else sys.stderr
@@ -103,6 +135,43 @@ def progress_on_stderr(*, quiet: bool, patience_s: float = PATIENCE_S) -> Iterat
         bar.close()
         if stream is not sys.stderr and stream is not None:
             stream.close()
+
+
+@contextmanager
+def progress_in_notebook() -> Iterator[Progress]:
+    """The same in the output of a notebook's cell, without a widget: lines, and below them a bar while it works."""
+    course, lines, began = Course(), list[str](), time.monotonic()
+
+    def content(*, over: bool = False) -> dict[str, Any]:
+        """The cell's output as HTML and as text; the bar is gone when all is over."""
+        where, text = course.where(), "\n".join(lines)
+        bar = f'<progress max="1" value="{course.share:.3f}"></progress> {html.escape(where)}'
+        page = f"<pre>{html.escape(text)}</pre>{'' if over or not where else bar}"
+        return {"text/html": page, "text/plain": text if over or not where else f"{text}\n{where}"}
+
+    cell = import_module("IPython.display").display(content(), raw=True, display_id=True)
+
+    def progress(sentence: str) -> None:
+        """Tell what happens now."""
+        LOGGER.info(sentence)
+        if course.hear(sentence):
+            lines.append(f"{_clock(began)} {printable(sentence)}")
+            cell.update(content(), raw=True)
+
+    def redraw(over: threading.Event) -> None:
+        """Move the bar on."""
+        while not over.wait(REDRAWN_S):
+            cell.update(content(), raw=True)
+
+    try:
+        with _beside(redraw):
+            yield progress
+    finally:
+        cell.update(content(over=True), raw=True)
+
+
+def _clock(began: float) -> str:
+    return f"[{time.monotonic() - began:6.1f} s]"
 
 
 def fitted(line: str, stream: TextIO | None) -> str:
@@ -134,13 +203,50 @@ def _beside(work: Callable[[threading.Event], None]) -> Iterator[None]:
         thread.join()
 
 
-class Bar:
-    """A bar on stderr, below the lines of a run, once a forecast has come; none where that is no terminal."""
+class Course:
+    """How far a run is, by what was heard of it; nothing can be said before a forecast has come."""
 
     def __init__(self) -> None:
         self._begun: Mapping[Stage, float] = {}
         self._seconds: Mapping[Stage, float] = {}
-        self._share = 0.0
+        self._forecast = ""
+        self.share = 0.0
+
+    @property
+    def known(self) -> bool:
+        """Whether there is something to say."""
+        return sum(self._seconds.values()) > 0.0 and bool(self._begun.keys() & self._seconds)
+
+    def hear(self, sentence: str) -> bool:
+        """Take in what a sentence says of the run; whether it is new to the person who waits."""
+        if isinstance(sentence, Told | Line) and sentence.stage is not None:
+            self._begun = {sentence.stage: time.monotonic(), **self._begun}  # a stage has begun once
+        if isinstance(sentence, Forecast):
+            known, self._forecast, self._seconds = self._forecast, str(sentence), sentence.seconds
+            return self._forecast != known
+        return isinstance(sentence, Line)
+
+    def now(self) -> Place:
+        """The place at this moment, whose share never falls; of a course that is known."""
+        at = place(self._seconds, self._begun, time.monotonic())
+        self.share = max(self.share, at.share)
+        return Place(at.stage, self.share, at.left)
+
+    def where(self) -> str:
+        """The place in words; empty where nothing is known."""
+        return "" if not self.known else "{}, {}, {}".format(*in_words(self.now()))
+
+
+def in_words(at: Place) -> tuple[str, str, str]:
+    """Stage, share and time left."""
+    return at.stage, f"{math.floor(100.0 * at.share)} %", f"{about(at.left)} left"
+
+
+class Bar(Course):
+    """A bar on stderr, below the lines of a run, once its course is known; none where that is no terminal."""
+
+    def __init__(self) -> None:
+        super().__init__()
         self._live: Live | None = None
 
     @property
@@ -148,14 +254,10 @@ class Bar:
         """Whether it is seen."""
         return self._live is not None
 
-    def tell(self, sentence: str, line: str) -> None:
-        """Take in what a sentence says of the run, and print its line."""
-        if isinstance(sentence, Told):
-            self._begun = {sentence.stage: time.monotonic(), **self._begun}  # a stage has begun once
-        if isinstance(sentence, Forecast) and sum(sentence.seconds.values()) > 0.0:
-            self._seconds = sentence.seconds
-            if self._live is None and self._begun.keys() & sentence.seconds:
-                self._live = _started(self)
+    def show(self, line: str) -> None:
+        """Print a line above the bar, which begins with the first line after which there is something to say."""
+        if self._live is None and self.known:
+            self._live = _started(self)
         if self._live is None:
             tell(line, sys.stderr)
         else:
@@ -171,26 +273,17 @@ class Bar:
 
     def __rich__(self) -> Table:
         """The bar as it is at this moment."""
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-
-        at = place(self._seconds, self._begun, time.monotonic())
-        self._share = max(self._share, at.share)
+        stage, share, left = in_words(self.now())
         row = Table.grid(padding=(0, 1))
-        bar = ProgressBar(total=1.0, completed=self._share, width=WIDTH, complete_style="green")
-        row.add_row(f"{at.stage:13}", bar, f"{math.floor(100.0 * self._share)} %", f"{about(at.left)} left")
+        bar = ProgressBar(total=1.0, completed=self.share, width=WIDTH, complete_style="green")
+        row.add_row(f"{stage:13}", bar, share, left)
         return row
 
 
 def _started(bar: Bar) -> Live | None:
     """The bar at work; None where stderr is no terminal that can be written over."""
-    try:
-        if sys.stderr is None or not sys.stderr.isatty():
-            return None
-    except ValueError:  # closed
+    if not _is_terminal(sys.stderr):
         return None
-    from rich.console import Console
-    from rich.live import Live
 
     class Terminal(Console):
         """One whose cursor stays: a process that is killed cannot bring it back."""
