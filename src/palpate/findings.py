@@ -45,6 +45,7 @@ Misleading = Literal[
     "data-misfit",
     "force-reversed",
     "no-equilibrium",
+    "beyond-interval",
 ]
 Widening = Literal[
     "ratio-only",
