@@ -22,6 +22,7 @@ from palpate.report.report_data import ReportData
 from palpate.report.rows import NONE, EstimateRow, estimate_rows, interval_text, number, scale_marks
 from palpate.report.slices import alignment_svg, first_planes, slice_svg
 from palpate.report.svg import template_of
+from palpate.report.units import shown_unit
 from palpate.report.volume import Grey, grey_of
 from palpate.study.case import Case
 from palpate.study.check import Checked, Problem
@@ -54,7 +55,7 @@ def preview_page(checked: Checked, *, created: str, version: str, no_prediction:
     scripts = page_scripts(SCRIPTS) if images else ()
     cost, drawn, later = report.cost, len(images), sum(len(pair.after) for pair in checked.states)
     tissues = shown.states.before.tissues if shown else ()
-    expected, marks = _expected(prediction, shown.states if shown else None)
+    expected, marks, axis = _expected(prediction, shown.states if shown else None)
     return str(
         template_of("preview.html").render(
             id=report.id,
@@ -68,6 +69,7 @@ def preview_page(checked: Checked, *, created: str, version: str, no_prediction:
             problems=report.problems,
             predicted=expected,
             marks=marks,
+            axis=axis,
             noise=prediction
             and {
                 "sd": number(prediction.noise_sd_mm, digits=2),
@@ -210,10 +212,10 @@ def _rows(tissues: tuple[Tissue, ...], looks: Sequence[TissueLook]) -> Iterator[
 
 def _expected(
     prediction: Prediction | None, states: ImagedStates | None
-) -> tuple[tuple[tuple[EstimateRow, str, str, str], ...], tuple[tuple[float, str], ...]]:
-    """A row a modulus with its interval, guess and unit as texts, and the marks of their common scale."""
+) -> tuple[tuple[tuple[EstimateRow, str, str, str], ...], tuple[tuple[float, str], ...], str]:
+    """A row for each modulus with its interval, guess and unit as texts; marks and label of their common scale."""
     if prediction is None or states is None:
-        return (), ()
+        return (), (), ""
     colours = dict(zip([t.name for t in states.before.tissues], tissue_colours(states.before.tissues), strict=True))
     items = []
     for of in prediction.moduli:
@@ -230,7 +232,7 @@ def _expected(
     for row, of in zip(estimate_rows(document, colours), prediction.moduli, strict=True):
         unit = "kPa" if of.unit == "kPa" else f"× {of.relative_to}"
         found.append((row, interval_text(of.interval95), number(of.guess), unit))
-    return tuple(found), scale_marks(document)
+    return tuple(found), scale_marks(document), shown_unit(document).axis
 
 
 def _grey(case: Case, states: ImagedStates, after: int | None) -> Grey | None:

@@ -54,6 +54,20 @@ class ModulusUnit:
         """A modulus of the document's lists (starts, regions, image pairs; kPa or a ratio there), in this unit."""
         return number / self.reference_kpa if self.name == "ratio" and self.reference_kpa else number
 
+    def ends(self, item: Mapping[str, Any], value: float, ends: Interval) -> tuple[float, float]:
+        """A closed interval about a value of that tissue in the document's lists, in this unit.
+
+        Where the known modulus is a range, its part is taken out of a ratio's, as in `profile`.
+        """
+        low, high = (end or math.nan for end in ends)
+        if self.name == "kPa" or not self.reference_kpa:
+            return low, high
+        out = NORMAL_95 * scale_sd(item)
+        halves = (math.sqrt(max(math.log(end / value) ** 2 - out**2, 0.0)) for end in (low, high))
+        below, above = halves
+        middle = self.of_document(value)
+        return middle * math.exp(-below), middle * math.exp(above)
+
     def profile(self, item: Mapping[str, Any]) -> tuple[tuple[float, float], ...]:
         """The profile of an entry of "estimates" in this unit: values with signed root deviances.
 
