@@ -94,7 +94,7 @@ def is_covered(document: Mapping[str, Any], cause: str, subject: str) -> bool:
 
 def coverage(document: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Assumptions that were varied: those that the 95 % interval holds, and those that it does not hold."""
-    bars = dict.fromkeys((each["cause"], each["subject"]) for each in document["variations"])
+    bars = dict.fromkeys((each["cause"], each["subject"]) for each in document.get("variations", ()))
     named = [(NAMES.get(cause, cause).format(subject), is_covered(document, cause, subject)) for cause, subject in bars]
     return tuple(name for name, held in named if held), tuple(name for name, held in named if not held)
 
