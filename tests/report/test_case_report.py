@@ -469,7 +469,7 @@ def test_what_would_change_the_answer_is_drawn_and_a_ratio_leads_where_the_scale
     )
     estimation = dataclasses.replace(case_result.estimation, estimates=(ranged, second), variations=changes)
     page = words_of(dataclasses.replace(case_result, estimation=estimation))
-    assert "Tornado of prostate: modulus of surroundings: x 1.2: +0 %" in page  # a ratio to it does not follow it
+    assert "Tornado of prostate: modulus of surroundings: x 1.2: no change" in page  # a ratio to it does not follow it
     assert page.count("What would change this answer") == 1
     leads, follows = page.index("5.89 <small>× surroundings"), page.index("58.9 kPa if surroundings has 10.0 kPa")
     assert leads < follows

@@ -36,7 +36,7 @@ FADING = 0.6  # of a cause's opacity, that of the next one on the bar
 FOUND = {
     "identified": "The images fix the stiffness of {}.",
     "weak": "The stiffness of {} is less sure: use the interval, not the number alone.",
-    "ratio only": "The images fix the stiffness of {} as a ratio to the others, not as a number of kilopascals.",
+    "ratio only": "The images fix the stiffness of {} only as a ratio, not in kilopascals.",
 }
 MISSED = "The fitted model misses some of the data by more than their errors: the interval does not cover that."
 OPEN = "The images do not fix the stiffness of {}: do not use {}."
@@ -179,7 +179,7 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
             expected=expected_share(value, interval, truth) if value and truth else NONE,
             bar=_bar(value, interval, truth=truth, scale=scale) if scale and value and interval else None,
             shares=_shares(_largest(shares)),
-            causes=listed([f"{cause} {100.0 * share:.0f} %" for cause, share in shares.items()])
+            causes=listed([f"{cause} {_percent(share)}" for cause, share in shares.items()])
             if len(shares) > MOST_CAUSES
             else "",
             sources=_shares({BELIEVED if kind == "prior" else kind: share for kind, share in largest}) if found else (),
@@ -285,11 +285,16 @@ def _scale(items: Iterable[Mapping[str, Any]], unit: ModulusUnit) -> tuple[float
     return low - room, high + room
 
 
+def _percent(share: float) -> str:
+    """A share of 1 in per cent; one that rounds to nothing is not said to be nothing."""
+    return "under 1 %" if 0.0 < share < 0.005 else f"{100.0 * share:.0f} %"
+
+
 def _shares(parts: Mapping[str, float]) -> tuple[Share, ...]:
     """Parts of 1 by their names, one after the other along a bar."""
     found, place = list[Share](), 0.0
     for number, (name, part) in enumerate(parts.items()):
-        found.append(Share(name, f"{100 * part:.0f} %", place, BAR * part, round(FADING**number, 2)))
+        found.append(Share(name, _percent(part), place, BAR * part, round(FADING**number, 2)))
         place += BAR * part
     return tuple(found)
 

@@ -114,8 +114,8 @@ def _sure(document: Mapping[str, Any], unit: ModulusUnit) -> Iterator[str]:
     if "data-misfit" in codes:
         yield "The model does not explain all of the data: the errors can be larger than the ranges say."
     if grave := [code for code in codes - {"data-misfit"} if code not in (*WIDENING, *HARMLESS)]:
-        count = "A warning says" if len(grave) == 1 else f"{len(grave)} warnings say"
-        yield f"{count} what can make a number wrong by more than its range; read them below."
+        count, them = ("A warning says", "it") if len(grave) == 1 else (f"{len(grave)} warnings say", "them")
+        yield f"{count} what can make a number wrong by more than its range; read {them} below."
     minima = {start["minimum"] for start in document["starts"] if start["minimum"] is not None}
     if len(minima) > 1:
         yield f"The search found {len(minima)} different answers; the one that fits best is shown."

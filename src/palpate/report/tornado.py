@@ -116,7 +116,7 @@ def effect_text(row: TornadoRow, *, reasons: bool = False) -> str:
     words = []
     for setting, change in row.effects.items():
         end = " (at the search's bound)" if setting in row.at_bound else ""
-        words.append(f"{setting}: {100.0 * math.expm1(change):+.3g} %{end}")
+        words.append(f"{setting}: {f'{100.0 * math.expm1(change):+.3g} %' if change else 'no change'}{end}")
     words += [f"{setting}: {why if reasons else 'no estimate'}" for setting, why in row.failed.items()]
     return ", ".join(words)
 
