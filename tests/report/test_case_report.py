@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import hashlib
 import json
+import math
 import re
 from html.parser import HTMLParser
 from itertools import combinations
@@ -464,7 +465,9 @@ def test_what_would_change_the_answer_is_drawn_and_a_ratio_leads_where_the_scale
     first, second = case_result.estimation.estimates
     ranged = dataclasses.replace(first, verdict="ratio only", ratio=5.89, ratio_interval95=(4.9, 7.1))
     changes = (
-        Variation("known_modulus", "surroundings", "x 1.2", "exact", {"prostate": 0.182, "bladder": 0.182}),
+        Variation(
+            "known_modulus", "surroundings", "x 1.2", "exact", dict.fromkeys(("prostate", "bladder"), math.log(1.2))
+        ),
         Variation("law", "", "linear", "linearised", None, reason="the estimate did not converge"),
     )
     estimation = dataclasses.replace(case_result.estimation, estimates=(ranged, second), variations=changes)

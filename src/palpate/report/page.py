@@ -39,7 +39,7 @@ from palpate.report.stiffness_maps import map_png, map_svg
 from palpate.report.summary import summary
 from palpate.report.svg import template_of
 from palpate.report.tornado import coverage, tornado_svg
-from palpate.report.units import shown_correlation, shown_unit
+from palpate.report.units import given_text, shown_correlation, shown_unit
 
 T = TypeVar("T")
 LOGGER = logging.getLogger(__name__)
@@ -132,6 +132,7 @@ def render(data: ReportData, *, study: bool = False) -> str:
         ),
         tornados=of_moduli("{}", tornado, "change", lambda _: data.document.get("variations")),
         coverage=coverage(data.document),
+        given_text=given_text,
         repeats=of_moduli("Repeats of {}", repeats_svg, "repeats", lambda _: data.document["image_pairs"]),
         angles=(
             picture_of("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))

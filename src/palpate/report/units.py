@@ -106,6 +106,14 @@ def shown_unit(document: Mapping[str, Any], name: UnitName | None = None) -> Mod
     )
 
 
+def given_text(document: Mapping[str, Any], tissue: str, kpa: float) -> str:
+    """A known modulus as the case gives it: "10 kPa", or "4 to 25 kPa" where that is a range about `kpa`."""
+    given = document["case"].get("tissues", {}).get(tissue, {}).get("youngs_modulus_kpa")
+    if isinstance(given, list | tuple):
+        return f"{given[0]:g} to {given[1]:g} kPa"
+    return f"{kpa:g} kPa"
+
+
 def scale_sd(item: Mapping[str, Any]) -> float:
     """Standard deviation of ln E that the range of the known modulus leaves in an entry of "estimates", dimensionless.
 
