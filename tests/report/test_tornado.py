@@ -83,7 +83,7 @@ def test_the_page_says_it_in_each_row_and_claims_nothing_of_all_rows():
     for row in tornado_rows(document(), "gland"):
         label = row.label.replace("'", "&#39;")
         cells = page[page.index(f'<td class="name">{label}') :].split("</tr>")[0]
-        assert cells.endswith(f"in the interval\">{'yes' if row.covered else 'no'}</td>")
+        assert cells.endswith(f'in the interval">{"yes" if row.covered else "no"}</td>')
 
 
 def test_what_is_known_as_a_ratio_alone_is_varied_as_a_ratio():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -107,8 +107,9 @@ def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
     def draw(figure: Figure) -> None:
         """The paths, the 95 % interval as a band and the truth as a dashed line, where they are known."""
         _paths(figure, paths, unit.axis)
-        if interval is not None and None not in interval:
-            figure.axes[0].axhspan(interval[0], interval[1], color=INK, alpha=0.1, linewidth=0)
+        low, high = interval or (None, None)
+        if low is not None and high is not None:
+            figure.axes[0].axhspan(low, high, color=INK, alpha=0.1, linewidth=0)
         if truth is not None:
             figure.axes[0].axhline(truth, color=INK, linewidth=1.0, linestyle=DASHED)
         if figure.axes[0].get_yscale() == "log":
@@ -222,8 +223,8 @@ def region_svg(data: ReportData, region: int, *, name: str) -> str:
         axes.plot(*boundary, color=colour, linewidth=1.4)
         axes.plot(*ellipse, color=INK, linewidth=1.0, linestyle=DASHED)
         axes.plot([_value(first, unit)], [_value(second, unit)], "o", color=colour, markeredgecolor=INK)
-        if None not in truths:
-            axes.plot(truths[:1], truths[1:], "x", color=INK, markersize=7)
+        if truths[0] is not None and truths[1] is not None:
+            axes.plot([truths[0]], [truths[1]], "x", color=INK, markersize=7)
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_xlabel(_of_tissue(first, unit))
@@ -277,7 +278,7 @@ def repeats_svg(data: ReportData, estimate: int, *, name: str) -> str:
     return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
-def _closed(corners: list[list[float]]) -> NDArray[np.float64]:
+def _closed(corners: Sequence[tuple[float, float]]) -> NDArray[np.float64]:
     """A smooth closed line (2, n) through places (n_corners, 2), both kPa or ratios."""
     logarithms = np.log(np.array([*corners, corners[0]]))
     line = CubicSpline(np.arange(len(logarithms)), logarithms, bc_type="periodic")

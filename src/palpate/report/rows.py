@@ -214,7 +214,7 @@ def _truth(item: Mapping[str, Any], truth: float | None, unit: ModulusUnit) -> s
 
 def _causes(item: Mapping[str, Any], unit: ModulusUnit) -> dict[str, float]:
     """Share of each cause in the variance of what is shown, the largest first; of ratios without the known modulus."""
-    shares = dict(item.get("variance_shares") or {})
+    shares = dict[str, float](item.get("variance_shares") or {})
     if unit.name == "ratio":
         shares.pop(KNOWN_MODULUS, None)
     whole = sum(shares.values()) or 1.0

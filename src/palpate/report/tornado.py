@@ -83,13 +83,14 @@ def is_covered(document: Mapping[str, Any], cause: str, subject: str) -> bool:
     """
     case = document["case"]
     left_out, tissue = case.get("discrepancy", {}), case.get("tissues", {}).get(subject, {})
-    return {
+    held: dict[str, bool] = {
         "poisson_ratio": left_out.get("poisson_sd", 0.0) > 0.0,
         "segmentation": left_out.get("surface_offset_mm", 0.0) > 0.0,
         "frame": case.get("domain", {}).get("outer_boundary") == "moving",
         "known_modulus": isinstance(tissue.get("youngs_modulus_kpa"), list | tuple),
         "edge_length": True,
-    }.get(cause, False)
+    }
+    return held.get(cause, False)
 
 
 def coverage(document: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -46,9 +46,10 @@ class ModulusUnit:
 
     def truth(self, item: Mapping[str, Any]) -> float | None:
         """The true modulus of an entry of "estimates", in this unit; None where one of the two is not known."""
-        if self.name == "kPa" or item["truth"] is None:
-            return item["truth"]
-        return None if self.true_reference_kpa is None else item["truth"] / self.true_reference_kpa
+        true_kpa: float | None = item["truth"]
+        if self.name == "kPa" or true_kpa is None:
+            return true_kpa
+        return None if self.true_reference_kpa is None else true_kpa / self.true_reference_kpa
 
     def of_document(self, number: float) -> float:
         """A modulus of the document's lists (starts, regions, image pairs; kPa or a ratio there), in this unit."""
