@@ -19,7 +19,7 @@ from palpate.report.page import page_scripts, picture_of, policy_of, widths_of
 from palpate.report.payload import payload
 from palpate.report.preview_data import ROLE_COLOURS, PreviewImage, preview_data, preview_image
 from palpate.report.report_data import ReportData
-from palpate.report.rows import NONE, EstimateRow, estimate_rows, interval_text, number, scale_marks
+from palpate.report.rows import NONE, EstimateRow, estimate_rows, number, scale_marks
 from palpate.report.slices import alignment_svg, first_planes, slice_svg
 from palpate.report.svg import template_of
 from palpate.report.units import shown_unit
@@ -223,15 +223,13 @@ def _expected(
         interval = list(of.interval95)
         item: dict[str, Any] = {"parameter": "youngs_modulus", "tissue": of.tissue, "unit": of.unit}
         item |= {"value": of.guess if kpa else None, "interval95": interval if kpa else None}
-        item |= {"ratio": None if kpa else of.guess, "ratio_interval95": None if kpa else interval}
+        item |= {"ratio": of.ratio if kpa else of.guess, "ratio_interval95": of.ratio_interval95 if kpa else interval}
         shares = {cause: share for cause, share in of.shares.items() if share >= LEAST_SHARE}
         item |= {"relative_to": of.relative_to, "verdict": of.verdict, "why": of.why}
         items.append(item | {"truth": None, "variance_shares": shares})
     document = {"status": "converged", "estimates": items, "case": {}}
-    found = []
-    for row, of in zip(estimate_rows(document, colours), prediction.moduli, strict=True):
-        unit = "kPa" if of.unit == "kPa" else f"× {of.relative_to}"
-        found.append((row, interval_text(of.interval95), number(of.guess), unit))
+    rows = estimate_rows(document, colours)
+    found = [(row, row.shown_interval, row.shown, row.shown_in) for row in rows]
     return tuple(found), scale_marks(document), shown_unit(document).axis
 
 

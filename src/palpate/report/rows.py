@@ -219,7 +219,7 @@ def _causes(item: Mapping[str, Any], unit: ModulusUnit) -> dict[str, float]:
         shares.pop(KNOWN_MODULUS, None)
     whole = sum(shares.values()) or 1.0
     ranked = sorted(shares.items(), key=lambda share: -share[1])
-    return {CAUSES.get(cause, cause): share / whole for cause, share in ranked}
+    return {str(CAUSES.get(cause, cause)): share / whole for cause, share in ranked}
 
 
 def _largest(shares: Mapping[str, float]) -> dict[str, float]:
