@@ -16,7 +16,9 @@ import pytest
 import referencing
 
 from palpate.cli import main
+from palpate.export.model_file import read_model
 from palpate.images.readers import write_label_image
+from palpate.report.tornado import is_covered
 from palpate.study.case_file import read_case
 from palpate.study.json_schema import SCHEMAS
 from scenes import VOXEL_MM, balls
@@ -133,6 +135,32 @@ def test_the_result_meets_the_schema_that_is_shipped(result):
     schemas = {name: json.loads((SCHEMAS / name).read_text()) for name in ("case.schema.json", "result.schema.json")}
     registry = referencing.Registry().with_contents(schemas.items())
     jsonschema.Draft202012Validator(schemas["result.schema.json"], registry=registry).validate(result)
+
+
+def test_poissons_ratios_that_were_fitted_stand_in_the_result_as_in_the_model_that_is_exported(outputs, result):
+    body = read_model(outputs).bodies[0]
+    exported = {tissue.name: tissue.poisson_ratio for tissue in body.mesh.tissues if tissue.meshed}
+    assert {each["tissue"]: each["fitted"] for each in result["poisson_ratios"]} == pytest.approx(exported)
+    for each in result["poisson_ratios"]:
+        assert (each["stated"], each["pair"]) == (0.45, 1)
+        assert 0.0 < each["sd"] <= 0.02  # what was believed of it, and what the images add
+        assert abs(each["fitted"] - each["stated"]) < 3.0 * 0.02
+
+
+def test_what_is_said_to_be_in_the_interval_has_a_share_in_the_variance_and_nothing_else(result):
+    """By assumption, as the report and the sensitivity study say it."""
+    causes = {
+        "poisson_ratio": "poisson",
+        "segmentation": "offset",
+        "frame": "frame",
+        "edge_length": "mesh",
+        "known_modulus": "known modulus",
+    }
+    bars = {(each["cause"], each["subject"]) for each in result["variations"]} | {("edge_length", "")}
+    assert {cause for cause, _ in bars} >= {"poisson_ratio", "segmentation", "known_modulus", "law"}
+    for item in result["estimates"]:
+        for cause, subject in bars:
+            assert is_covered(result, cause, subject) == (causes.get(cause, "none") in item["variance_shares"]), cause
 
 
 def test_the_truth_lies_within_the_interval(result):

@@ -46,6 +46,7 @@ Misleading = Literal[
     "data-misfit",
     "force-reversed",
     "no-equilibrium",
+    "beyond-interval",
 ]
 Widening = Literal[
     "ratio-only",

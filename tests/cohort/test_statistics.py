@@ -142,7 +142,7 @@ def test_what_is_not_identified_enters_by_its_ends_or_is_left_out_and_named(few)
     assert organ["per_patient"]["n_censored"] == 1
     assert organ["by_stage"][0]["n_censored"] == 1
     page = cohort_page(changed, document, created="now", version="0")
-    assert "not identified, no end known: left out" in page
+    assert "left out, not identified and no end of the interval known" in page
 
 
 def test_the_table_says_which_rows_enter_the_statistics_and_why_others_do_not(few):

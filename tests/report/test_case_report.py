@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import hashlib
 import json
+import math
 import re
 from html.parser import HTMLParser
 from itertools import combinations
@@ -449,9 +450,12 @@ def test_the_profile_and_the_causes_of_the_variance_are_shown_where_they_are_kno
     estimation = dataclasses.replace(case_result.estimation, estimates=(seen, second))
     page = words_of(dataclasses.replace(case_result, estimation=estimation))
     assert page.count("Profile likelihood of") == 1
-    assert "Profile likelihood of prostate: lowest at 58.9, 95 % interval 47.1 to 73.6." in page
+    assert "Profile likelihood of prostate: lowest at 58.9 kPa, 95 % interval 47.1 to 73.6." in page
     assert page.count("its variance:") == 1
     assert "the drivers&#39; motion 10 %" in page
+    bar = page[page.index("its variance:") : page.index("All causes")]
+    assert bar.count("swatch") == 4  # the three largest causes, and the others together
+    assert "others 20 %" in bar
     assert "the mesh 10 %" in page
     assert "the range of the known modulus 5 %" in page
     assert "could not be drawn" not in page
@@ -461,15 +465,23 @@ def test_what_would_change_the_answer_is_drawn_and_a_ratio_leads_where_the_scale
     first, second = case_result.estimation.estimates
     ranged = dataclasses.replace(first, verdict="ratio only", ratio=5.89, ratio_interval95=(4.9, 7.1))
     changes = (
-        Variation("known_modulus", "surroundings", "x 1.2", "exact", {"prostate": 0.182, "bladder": 0.182}),
+        Variation(
+            "known_modulus", "surroundings", "x 1.2", "exact", dict.fromkeys(("prostate", "bladder"), math.log(1.2))
+        ),
         Variation("law", "", "linear", "linearised", None, reason="the estimate did not converge"),
     )
     estimation = dataclasses.replace(case_result.estimation, estimates=(ranged, second), variations=changes)
     page = words_of(dataclasses.replace(case_result, estimation=estimation))
-    assert "Tornado of prostate: modulus of surroundings: x 1.2: +20 %" in page
+    assert "Tornado of prostate: modulus of surroundings: x 1.2: no change" in page  # a ratio to it does not follow it
     assert page.count("What would change this answer") == 1
-    leads, follows = page.index("5.89 <small>"), page.index("58.9 kPa (47.1 to 73.6) if surroundings has 10.0 kPa")
+    leads, follows = page.index("5.89 <small>× surroundings"), page.index("58.9 kPa if surroundings has 10.0 kPa")
     assert leads < follows
+    assert "over that range 47.1 to 73.6 kPa" in page
+    assert "The interval holds none of these." in page
+    in_kpa = dataclasses.replace(estimation, estimates=(first, second))
+    page_in_kpa = words_of(dataclasses.replace(case_result, estimation=in_kpa))
+    assert "Tornado of prostate: modulus of surroundings: x 1.2: +20 %" in page_in_kpa
+    assert "could not be drawn" not in page_in_kpa
     assert "could not be drawn" not in page
 
 
@@ -495,7 +507,7 @@ def test_two_moduli_together_and_what_each_image_says_alone_are_shown_where_they
     low, high = 58.9 * np.exp(-0.2), 58.9 * np.exp(0.2)
     spans = f"prostate {low:.1f} to {high:.1f} and bladder 28.2 to 34.5"
     assert page.count(f"Joint 95 % region: {spans}, cut by the bounds of the search.") == 1
-    assert page.count("prostate by each later image alone: 1 55.0, 2 20.0 (an outlier); all together 58.9.") == 1
+    assert page.count("prostate by each later image alone, kPa: 1 55.0, 2 20.0 (an outlier); all together 58.9.") == 1
     assert "would have a probability of 0.021" in page.lower()
     assert "prostate 10 %" in page
     assert "could not be drawn" not in page

@@ -71,6 +71,7 @@ def test_the_label_of_the_misfit_lies_within_its_picture(case_result, figure_of,
 @pytest.mark.parametrize(("low", "high"), [(13.8, 36.6), (21.0, 24.0), (0.5, 900.0)])
 def test_the_scale_of_the_bars_has_three_to_six_marks(low, high):
     item = {"parameter": "youngs_modulus", "value": low, "interval95": [low, high], "truth": None}
+    item |= {"unit": "kPa", "verdict": "weak", "relative_to": "fat", "ratio": None}
     marks = scale_marks({"status": "converged", "estimates": [item]})
     assert 3 <= len(marks) <= 6
     assert all(low * 0.8 < float(label) < high * 1.25 for _, label in marks)

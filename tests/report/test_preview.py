@@ -116,6 +116,23 @@ def test_a_predicted_interval_is_called_a_prediction(checked):
     assert "stated in the case" in page
 
 
+def test_a_scale_within_a_range_alone_is_predicted_as_a_ratio_as_the_estimate_then_says_it(checked):
+    range_alone = PredictedModulus(
+        "prostate", "kPa", 20.0, (4.0, 100.0), "rest", "ratio only", "why", {"noise": 1.0}, 2.0, (1.5, 2.7)
+    )
+    prediction = Prediction((range_alone,), 0.3, 6.0, stated=True)
+    report = dataclasses.replace(checked.report, predicted=prediction)
+    page = page_of(dataclasses.replace(checked, report=report))
+    assert "predicted: ratio only" in page
+    assert "1.50 to 2.70 <small>× rest" in page
+    assert "E / E of rest (ratio)" in page
+    assert "4.00 to 100" not in page
+    assert "can hardly fix" not in page
+    assert prediction.lines() == [
+        "predicted for prostate, if it has 2 times rest: 95 % interval 1.5 to 2.7 times rest (ratio only)"
+    ]
+
+
 def test_a_case_that_is_refused_says_so_first(checked):
     refused = (Problem("InputDataError", "no such file", 3), *checked.report.problems)
     page = page_of(dataclasses.replace(checked, report=dataclasses.replace(checked.report, problems=refused)))

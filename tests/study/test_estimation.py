@@ -15,7 +15,7 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
 from palpate.study.samples import draw_moduli
 from palpate.study.stated_posterior import StatedPosterior
-from palpate.study.verdicts import estimates_of, hull, intervals_of, verdict
+from palpate.study.verdicts import estimates_of, hull, intervals_of, or_as_ratio, verdict
 from palpate.uncertainty import (
     FittedState,
     grid_position_shifts,
@@ -297,6 +297,20 @@ def test_what_a_range_leaves_open_is_told_as_a_ratio(twins, twin, settings, obse
         assert estimate.verdict == "ratio only"
         assert "range of the known modulus" in estimate.why
         assert np.divide(*estimate.ratio_interval95[::-1]) < 4.0 < np.divide(*estimate.interval95[::-1])
+
+
+@pytest.mark.parametrize(
+    ("word", "by_ratio", "told"),
+    [
+        ("not identified", (1.0, 3.0), "ratio only"),
+        ("weak", (1.0, 3.0), "ratio only"),
+        ("weak", (1.0, 6.0), "weak"),
+        ("not identified", (1.0, 20.0), "not identified"),
+        ("identified", (1.0, 2.0), "identified"),
+    ],
+)
+def test_a_ratio_is_told_where_it_says_more_than_kilopascals(word, by_ratio, told):
+    assert or_as_ratio((word, "why"), by_ratio, at_bound=False)[0] == told
 
 
 def test_an_interval_that_holds_no_layer_says_so(inversion, settings, observed):

@@ -14,6 +14,7 @@ from palpate.report.svg import INK, draw_svg, link_url, mark_decades
 
 SIZE = (4.4, 3.0)
 PLACE = (0.15, 0.2, 0.82, 0.74)
+ABOVE_COUNTS = (0.15, 0.3, 0.82, 0.64)  # of numbers of patients and scans under each stage
 ROW = 0.2  # inches of a patient in the forest
 MOST_IN_FOREST = 150
 COLOUR = "#0072b2"
@@ -35,8 +36,8 @@ def boxes_svg(patients: Patients, tissue: str, unit: str, *, name: str, pages: P
     stages, links = _stages(patients, tissue), _numbered(patients, pages)
 
     def draw(figure: Figure) -> None:
-        """A box and points a stage."""
-        axes = figure.add_axes(PLACE)
+        """A box and points for each stage."""
+        axes = figure.add_axes(ABOVE_COUNTS)
         axes.set_yscale("log")
         labels = []
         for stage in stages:
@@ -172,10 +173,10 @@ def _beside(count: int) -> Any:
 
 
 def _axis(unit: str) -> str:
-    return "Young's modulus (kPa)" if unit == "kPa" else "ratio of moduli"
+    return "Young's modulus (kPa)" if unit == "kPa" else "E / E of reference tissue (ratio)"
 
 
 def _label(axes: Axes, unit: str) -> None:
-    axes.set_xlabel("stage")
+    axes.set_xlabel("stage (number)")
     axes.set_ylabel(_axis(unit))
     mark_decades(axes.yaxis)

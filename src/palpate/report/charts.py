@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from palpate.report.report_data import ModelSurface, ReportData
-from palpate.report.rows import interval_text, main_numbers, moduli_in, number
-from palpate.report.svg import INK, draw_svg
+from palpate.report.rows import interval_text, moduli_in, number
+from palpate.report.svg import INK, draw_svg, mark_decades
+from palpate.report.units import ModulusUnit, shown_region, shown_unit
 from palpate.uncertainty import NORMAL_95
 
 SIZE = (3.9, 2.5)
@@ -24,8 +23,8 @@ BINS = 41
 BROAD: dict[str, Any] = {"color": "#c98b00", "linewidth": 7.0, "alpha": 0.6, "solid_capstyle": "butt"}
 FITTED = "#3d8be0"
 LIMIT = NORMAL_95**2  # deviance at the ends of a 95 % interval
-FEWEST_MARKS = 3  # of an axis that can be read
 ROW_INCHES, MOST_LETTERS = 0.3, 24
+SHORT = 16  # letters of a tissue on an axis beside another one
 START_COLOURS = ("#3b7dd8", "#d9822b", "#3a9d5d", "#b0559b", "#8a6d3b", "#4aa3a3", "#c0504d", "#7f7fd0")
 
 
@@ -57,7 +56,7 @@ def residual_svg(data: ReportData, model: ModelSurface, *, voxel_mm: float, name
         axes.text(voxel, 1.0, " one voxel", transform=axes.get_xaxis_transform(), fontsize=7.5, va="top")
         axes.set_xlim(-reach, reach)
         axes.set_xlabel("signed distance (mm)")
-        axes.set_ylabel("surface (%)")
+        axes.set_ylabel("share of the surface (%)")
         axes.yaxis.set_major_locator(MaxNLocator(4))
 
     return draw_svg(draw, size=SIZE, name=name, says=says)
@@ -100,21 +99,21 @@ def objective_svg(data: ReportData, *, name: str) -> str:
 
 def modulus_svg(data: ReportData, estimate: int, *, name: str) -> str:
     """Modulus of one estimate (its number) against the iteration, as in `objective_svg`, with its interval, as SVG."""
-    item = data.document["estimates"][estimate]
-    paths = [list(path.get(item["tissue"], ())) for path in data.moduli_paths]
-    in_kpa = item["unit"] == "kPa"
-    says = f"Stiffness of {item['tissue']} by iteration. {_told(paths, 'kPa' if in_kpa else '')}"
+    item, unit = data.document["estimates"][estimate], shown_unit(data.document)
+    paths = [[unit.of_document(value) for value in path.get(item["tissue"], ())] for path in data.moduli_paths]
+    (_, interval), truth = unit.numbers(item), unit.truth(item)
+    says = f"Stiffness of {item['tissue']} by iteration. {_told(paths, unit.text)}"
 
     def draw(figure: Figure) -> None:
         """The paths, the 95 % interval as a band and the truth as a dashed line, where they are known."""
-        _paths(figure, paths, _label(item))
-        interval = item["interval95"] if in_kpa else item["ratio_interval95"]
-        if interval is not None and None not in interval:
-            figure.axes[0].axhspan(interval[0], interval[1], color=INK, alpha=0.1, linewidth=0)
-        if item["truth"] is not None:
-            figure.axes[0].axhline(item["truth"], color=INK, linewidth=1.0, linestyle=DASHED)
+        _paths(figure, paths, unit.axis)
+        low, high = interval or (None, None)
+        if low is not None and high is not None:
+            figure.axes[0].axhspan(low, high, color=INK, alpha=0.1, linewidth=0)
+        if truth is not None:
+            figure.axes[0].axhline(truth, color=INK, linewidth=1.0, linestyle=DASHED)
         if figure.axes[0].get_yscale() == "log":
-            _mark(figure.axes[0])
+            mark_decades(figure.axes[0].yaxis, most=6)
 
     return draw_svg(draw, size=SIZE, name=name, says=says)
 
@@ -134,7 +133,7 @@ def waterfall_svg(data: ReportData, *, name: str) -> str:
             colour = START_COLOURS[start % len(START_COLOURS)]
             filled = colour if starts[start]["status"] == "converged" else "none"
             axes.plot([rank], [ends[start]], "o", color=colour, markerfacecolor=filled, markersize=7)
-        axes.set_xlabel("start, from best to worst")
+        axes.set_xlabel("start, from best to worst (number)")
         axes.set_ylabel("final misfit (mm²)")
         axes.set_xlim(0.5, len(order) + 0.5)
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
@@ -163,7 +162,7 @@ def angle_svg(angles: NDArray[np.float32], *, name: str) -> str:
         axes.set_xlim(0, 180)
         axes.set_xticks(range(0, 181, 30))
         axes.set_xlabel("dihedral angle (degrees)")
-        axes.set_ylabel("share (%)")
+        axes.set_ylabel("share of the angles (%)")
         axes.yaxis.set_major_locator(MaxNLocator(4))
 
     least, middle, most = np.percentile(flat, [0.0, 50.0, 100.0])
@@ -177,10 +176,10 @@ def profile_svg(data: ReportData, estimate: int, *, name: str) -> str:
     Between the points that were computed its signed root is monotone in ln E; the interval is a band, and the dashed
     line the deviance 1.96^2 at the ends of a profile's.
     """
-    item = data.document["estimates"][estimate]
+    item, unit = data.document["estimates"][estimate], shown_unit(data.document)
     colour = _colour(data, item)
-    value, interval = main_numbers(item)
-    at, root = np.array(sorted(item["profile"]), dtype=np.float64).T
+    value, interval = unit.numbers(item)
+    at, root = np.array(sorted(unit.profile(item)), dtype=np.float64).T
     fine = np.linspace(np.log(at[0]), np.log(at[-1]), 201)
     between = PchipInterpolator(np.log(at), root)(fine)
 
@@ -198,12 +197,12 @@ def profile_svg(data: ReportData, estimate: int, *, name: str) -> str:
         axes.set_xscale("log")
         axes.set_xlim(*ends)
         axes.set_ylim(0.0, 1.6 * LIMIT)
-        _plain_numbers(axes.xaxis)
-        axes.set_xlabel(_label(item))
-        axes.set_ylabel("deviance")
+        mark_decades(axes.xaxis, most=6)
+        axes.set_xlabel(unit.axis)
+        axes.set_ylabel("deviance (no unit)")
         axes.yaxis.set_major_locator(MaxNLocator(4))
 
-    told = f"lowest at {number(value)}, 95 % interval {interval_text(interval)}"
+    told = f"lowest at {number(value)} {unit.text}, 95 % interval {interval_text(interval)}"
     return draw_svg(draw, size=SIZE, name=name, says=f"Profile likelihood of {item['tissue']}: {told}.")
 
 
@@ -212,26 +211,26 @@ def region_svg(data: ReportData, region: int, *, name: str) -> str:
 
     Between the directions that were computed the boundary is a periodic cubic spline of ln E.
     """
-    of = data.document["regions"][region]
+    of, unit = data.document["regions"][region], shown_unit(data.document)
     first, second = (next(i for i in moduli_in(data.document) if i["tissue"] == tissue) for tissue in of["tissues"])
-    boundary, ellipse = _closed(of["boundary"]), _closed(of["ellipse"])
-    colour = _colour(data, first)
+    boundary, ellipse = map(_closed, shown_region(data.document, of))
+    colour, truths = _colour(data, first), (unit.truth(first), unit.truth(second))
 
     def draw(figure: Figure) -> None:
         """Both boundaries on logarithmic axes."""
-        axes = figure.add_axes((0.16, 0.2, 0.81, 0.74))
+        axes = figure.add_axes((0.21, 0.26, 0.76, 0.7))
         axes.fill(*boundary, facecolor=colour, alpha=0.25, linewidth=0)
         axes.plot(*boundary, color=colour, linewidth=1.4)
         axes.plot(*ellipse, color=INK, linewidth=1.0, linestyle=DASHED)
-        axes.plot([_value(first)], [_value(second)], "o", color=colour, markeredgecolor=INK)
-        if first["truth"] is not None and second["truth"] is not None:
-            axes.plot([first["truth"]], [second["truth"]], "x", color=INK, markersize=7)
+        axes.plot([_value(first, unit)], [_value(second, unit)], "o", color=colour, markeredgecolor=INK)
+        if truths[0] is not None and truths[1] is not None:
+            axes.plot([truths[0]], [truths[1]], "x", color=INK, markersize=7)
         axes.set_xscale("log")
         axes.set_yscale("log")
-        axes.set_xlabel(_label(first, of_tissue=True))
-        axes.set_ylabel(_label(second, of_tissue=True))
+        axes.set_xlabel(_of_tissue(first, unit))
+        axes.set_ylabel(_of_tissue(second, unit))
         for axis in (axes.xaxis, axes.yaxis):
-            _plain_numbers(axis)
+            mark_decades(axis, most=6)
 
     spans = [
         f"{t} {number(line.min())} to {number(line.max())}" for t, line in zip(of["tissues"], boundary, strict=True)
@@ -242,39 +241,44 @@ def region_svg(data: ReportData, region: int, *, name: str) -> str:
 
 def repeats_svg(data: ReportData, estimate: int, *, name: str) -> str:
     """One modulus (the estimate's number) as each later image alone says it, with the joint value, as SVG."""
-    item, pairs = moduli_in(data.document)[estimate], data.document["image_pairs"]
+    item, pairs, unit = moduli_in(data.document)[estimate], data.document["image_pairs"], shown_unit(data.document)
     tissue, colour = item["tissue"], _colour(data, item)
-    alone = [  # nothing of an image that has no minimum alone
-        (pair["moduli"].get(tissue), pair["interval95"].get(tissue), pair["outlier"]) for pair in pairs["alone"]
-    ]
-    low, high = pairs["mean_interval95"][tissue]
+    alone = list[tuple[float | None, tuple[float, float] | None, bool]]()
+    for pair in pairs["alone"]:
+        of_image, ends = pair["moduli"].get(tissue), pair["interval95"].get(tissue)
+        if of_image is None or ends is None:  # nothing of an image that has no minimum alone
+            alone.append((None, None, pair["outlier"]))
+        else:
+            alone.append((unit.of_document(of_image), unit.ends(item, of_image, ends), pair["outlier"]))
+    low, high = unit.ends(item, pairs["mean"][tissue], pairs["mean_interval95"][tissue])
+    value, truth = _value(item, unit), unit.truth(item)
 
     def draw(figure: Figure) -> None:
         """A dot with its interval for each image, hollow where it is an outlier."""
         axes = figure.add_axes((0.16, 0.2, 0.81, 0.74))
         axes.axhspan(low, high, color=INK, alpha=0.1, linewidth=0)
-        axes.axhline(_value(item), color=INK, linewidth=1.0)
-        if item["truth"] is not None:
-            axes.axhline(item["truth"], color=INK, linewidth=1.0, linestyle=DASHED)
-        for place, (value, ends, outlier) in enumerate(alone, start=1):
-            if value is None:
+        axes.axhline(value, color=INK, linewidth=1.0)
+        if truth is not None:
+            axes.axhline(truth, color=INK, linewidth=1.0, linestyle=DASHED)
+        for place, (of_image, ends, outlier) in enumerate(alone, start=1):
+            if of_image is None or ends is None:
                 continue
             axes.plot([place, place], ends, color=colour, linewidth=1.6)
             inside = "none" if outlier else colour
-            axes.plot([place], [value], "o", color=colour, markerfacecolor=inside, markersize=7)
+            axes.plot([place], [of_image], "o", color=colour, markerfacecolor=inside, markersize=7)
         axes.set_xlim(0.5, len(alone) + 0.5)
-        axes.set_xlabel("later image")
-        axes.set_ylabel(_label(item))
+        axes.set_xlabel("later image (number)")
+        axes.set_ylabel(unit.axis)
         axes.set_yscale("log")
         axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
-        _plain_numbers(axes.yaxis)
+        mark_decades(axes.yaxis, most=6)
 
-    parts = [f"{k} {number(value)}{' (an outlier)' if out else ''}" for k, (value, _, out) in enumerate(alone, start=1)]
-    says = f"{tissue} by each later image alone: {', '.join(parts)}; all together {number(_value(item))}."
+    parts = [f"{k} {number(one)}{' (an outlier)' if out else ''}" for k, (one, _, out) in enumerate(alone, start=1)]
+    says = f"{tissue} by each later image alone, {unit.text}: {', '.join(parts)}; all together {number(value)}."
     return draw_svg(draw, size=SIZE, name=name, says=says)
 
 
-def _closed(corners: list[list[float]]) -> NDArray[np.float64]:
+def _closed(corners: Sequence[tuple[float, float]]) -> NDArray[np.float64]:
     """A smooth closed line (2, n) through places (n_corners, 2), both kPa or ratios."""
     logarithms = np.log(np.array([*corners, corners[0]]))
     line = CubicSpline(np.arange(len(logarithms)), logarithms, bc_type="periodic")
@@ -285,15 +289,15 @@ def _colour(data: ReportData, item: Mapping[str, Any]) -> str:
     return next((tissue.colour for tissue in data.tissues if tissue.name == item["tissue"]), "#888888")
 
 
-def _value(item: Mapping[str, Any]) -> float:
-    value = main_numbers(item)[0]
+def _value(item: Mapping[str, Any], unit: ModulusUnit) -> float:
+    value = unit.numbers(item)[0]
     return np.nan if value is None else value
 
 
-def _label(item: Mapping[str, Any], *, of_tissue: bool = False) -> str:
-    """The quantity of an axis, with its unit."""
-    quantity = "E (kPa)" if item["unit"] == "kPa" else f"E / {item['relative_to'][:24]}"
-    return f"{item['tissue'][:24]}, {quantity}" if of_tissue else quantity
+def _of_tissue(item: Mapping[str, Any], unit: ModulusUnit) -> str:
+    """The label of an axis of one tissue's modulus, short enough to stand beside another's."""
+    name, to = (f"{of[: SHORT - 1]}…" if len(of) > SHORT else of for of in (item["tissue"], unit.relative_to))
+    return f"E of {name} (kPa)" if unit.name == "kPa" else f"E of {name} /\nE of {to} (ratio)"
 
 
 def _told(paths: list[list[float]], unit: str) -> str:
@@ -322,29 +326,11 @@ def _paths(figure: Figure, paths: list[list[float]], label: str) -> None:
             va="bottom",
             fontsize=7.5,
         )
-    axes.set_xlabel("iteration")
+    axes.set_xlabel("iteration (number)")
     axes.set_ylabel(label)
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     values = np.array([value for path in paths for value in path])
     if len(values) and (values > 0).all():
         axes.set_yscale("log")
-        _plain_numbers(axes.yaxis)
-        _mark(axes)
+        mark_decades(axes.yaxis, most=6)
     axes.grid(visible=True, axis="y")
-
-
-def _mark(axes: Axes) -> None:
-    """Round numbers along a logarithmic axis: two or more of 1, 2, 5 in a decade, else those of a linear one."""
-    low, high = axes.get_ylim()
-    marks = [m for m in LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, high) if low <= m <= high]
-    if len(marks) < FEWEST_MARKS:
-        marks = [m for m in MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high) if low <= m <= high]
-    axes.yaxis.set_major_locator(FixedLocator(marks))
-    axes.yaxis.set_minor_locator(NullLocator())
-
-
-def _plain_numbers(axis: Axis) -> None:
-    """A few round numbers on a logarithmic axis that spans less than a decade."""
-    axis.set_major_locator(MaxNLocator(5))
-    axis.set_major_formatter(FuncFormatter(lambda tick, _: f"{tick:.3g}"))
-    axis.set_minor_formatter(NullFormatter())

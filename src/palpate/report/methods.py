@@ -12,6 +12,7 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
 from palpate.report.report_data import MAP_OF, MESH, VARIATION, ReportData
 from palpate.report.rows import CAUSES, listed, moduli_in, ratio_rows
+from palpate.report.units import given_text
 from palpate.unknowns import KNOWN_MODULUS
 
 ELEMENTS = {
@@ -89,7 +90,9 @@ def _aim(data: ReportData, cite: Callable[[str], str]) -> str:
     for tissue in data.tissues:
         roles.setdefault(tissue.role, []).append(tissue.name)
     aligned = ALIGNED.get(dict(data.settings).get("alignment", ""), "")
-    known = [f"{t.name} ({t.given_kpa:g} kPa)" for t in data.tissues if t.given_kpa is not None]
+    known = [
+        f"{t.name} ({given_text(data.document, t.name, t.given_kpa)})" for t in data.tissues if t.given_kpa is not None
+    ]
     moved = f" The motion was driven by {listed(roles['driver'])} (hollow, not meshed)." if "driver" in roles else ""
     source = "segmented images of the same body in two or more states"
     if dict(data.settings).get("body") == MESH:

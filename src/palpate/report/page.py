@@ -36,8 +36,10 @@ from palpate.report.scales import angle_scale, distance_scale, modulus_scale, st
 from palpate.report.section import VIEWS
 from palpate.report.slices import alignment_svg, contour_names, first_planes, points_svg, slice_svg
 from palpate.report.stiffness_maps import map_png, map_svg
+from palpate.report.summary import summary
 from palpate.report.svg import template_of
-from palpate.report.tornado import tornado_svg
+from palpate.report.tornado import coverage, tornado_svg
+from palpate.report.units import given_text, shown_correlation, shown_unit
 
 T = TypeVar("T")
 LOGGER = logging.getLogger(__name__)
@@ -94,6 +96,9 @@ def render(data: ReportData, *, study: bool = False) -> str:
         study=study,
         document=data.document,
         headline=headline(data.document),
+        summary=summary(data.document),
+        unit=shown_unit(data.document),
+        correlation=shown_correlation(data.document),
         inputs=tuple(
             tuple(image for image in data.images if image.pair == pair)
             for pair in sorted({image.pair for image in data.images})
@@ -105,10 +110,7 @@ def render(data: ReportData, *, study: bool = False) -> str:
         rows=estimate_rows(data.document, colours),
         ratios=ratio_rows(data.document),
         marks=scale_marks(data.document),
-        starts=tuple(
-            {"colour": START_COLOURS[i % len(START_COLOURS)], **start}
-            for i, start in enumerate(data.document["starts"])
-        ),
+        starts=_starts(data.document),
         warnings=_warnings(data),
         contours=contour_names(data),
         later=tuple(_later(data, k, later) for k, later in enumerate(data.later)),
@@ -129,6 +131,8 @@ def render(data: ReportData, *, study: bool = False) -> str:
             if fixed.issuperset(region["tissues"])
         ),
         tornados=of_moduli("{}", tornado, "change", lambda _: data.document.get("variations")),
+        coverage=coverage(data.document),
+        given_text=given_text,
         repeats=of_moduli("Repeats of {}", repeats_svg, "repeats", lambda _: data.document["image_pairs"]),
         angles=(
             picture_of("Dihedral angles of the mesh", partial(angle_svg, data.mesh.angles, name="angles"))
@@ -142,6 +146,25 @@ def render(data: ReportData, *, study: bool = False) -> str:
         strain_scale=strain_scale() if data.mesh and len(data.mesh.strains) else None,
     )
     return str(page)
+
+
+def _starts(document: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
+    """The starts with their colours, and moduli in the unit that is shown."""
+    unit = shown_unit(document)
+
+    def shown(moduli: Mapping[str, float | None]) -> dict[str, float | None]:
+        """Moduli by tissue, where there are some."""
+        return {tissue: value and unit.of_document(value) for tissue, value in moduli.items()}
+
+    return tuple(
+        start
+        | {
+            "colour": START_COLOURS[i % len(START_COLOURS)],
+            "start": shown(start["start"]),
+            "end": shown(start["end"]),
+        }
+        for i, start in enumerate(document["starts"])
+    )
 
 
 def page_scripts(names: Sequence[str]) -> tuple[Markup, ...]:

@@ -18,9 +18,10 @@ from palpate.report.page import page_scripts, picture_of, policy_of, widths_of
 from palpate.report.payload import payload
 from palpate.report.preview_data import ROLE_COLOURS, PreviewImage, preview_data, preview_image
 from palpate.report.report_data import ReportData
-from palpate.report.rows import NONE, EstimateRow, estimate_rows, interval_text, number, scale_marks
+from palpate.report.rows import NONE, EstimateRow, estimate_rows, number, scale_marks
 from palpate.report.slices import alignment_svg, first_planes, slice_svg
 from palpate.report.svg import template_of
+from palpate.report.units import shown_unit
 from palpate.report.volume import Grey, grey_of
 from palpate.study.case import Case
 from palpate.study.check import Checked, Problem
@@ -53,7 +54,7 @@ def preview_page(checked: Checked, *, created: str, version: str, no_prediction:
     scripts = page_scripts(SCRIPTS) if images else ()
     cost, drawn, later = report.cost, len(images), sum(len(pair.after) for pair in checked.states)
     tissues = shown.states.before.tissues if shown else ()
-    expected, marks = _expected(prediction, shown.states if shown else None)
+    expected, marks, axis = _expected(prediction, shown.states if shown else None)
     return str(
         template_of("preview.html").render(
             id=report.id,
@@ -67,6 +68,7 @@ def preview_page(checked: Checked, *, created: str, version: str, no_prediction:
             problems=report.problems,
             predicted=expected,
             marks=marks,
+            axis=axis,
             noise=prediction
             and {
                 "sd": number(prediction.noise_sd_mm, digits=2),
@@ -209,10 +211,10 @@ def _rows(tissues: tuple[Tissue, ...], looks: Sequence[TissueLook]) -> Iterator[
 
 def _expected(
     prediction: Prediction | None, states: ImagedStates | None
-) -> tuple[tuple[tuple[EstimateRow, str, str, str], ...], tuple[tuple[float, str], ...]]:
-    """A row a modulus with its interval, guess and unit as texts, and the marks of their common scale."""
+) -> tuple[tuple[tuple[EstimateRow, str, str, str], ...], tuple[tuple[float, str], ...], str]:
+    """A row for each modulus with its interval, guess and unit as texts; marks and label of their common scale."""
     if prediction is None or states is None:
-        return (), ()
+        return (), (), ""
     colours = dict(zip([t.name for t in states.before.tissues], tissue_colours(states.before.tissues), strict=True))
     items = []
     for of in prediction.moduli:
@@ -220,16 +222,14 @@ def _expected(
         interval = list(of.interval95)
         item: dict[str, Any] = {"parameter": "youngs_modulus", "tissue": of.tissue, "unit": of.unit}
         item |= {"value": of.guess if kpa else None, "interval95": interval if kpa else None}
-        item |= {"ratio": None if kpa else of.guess, "ratio_interval95": None if kpa else interval}
+        item |= {"ratio": of.ratio if kpa else of.guess, "ratio_interval95": of.ratio_interval95 if kpa else interval}
         shares = {cause: share for cause, share in of.shares.items() if share >= LEAST_SHARE}
         item |= {"relative_to": of.relative_to, "verdict": of.verdict, "why": of.why}
         items.append(item | {"truth": None, "variance_shares": shares})
     document = {"status": "converged", "estimates": items, "case": {}}
-    found = []
-    for row, of in zip(estimate_rows(document, colours), prediction.moduli, strict=True):
-        unit = "kPa" if of.unit == "kPa" else f"× {of.relative_to}"
-        found.append((row, interval_text(of.interval95), number(of.guess), unit))
-    return tuple(found), scale_marks(document)
+    rows = estimate_rows(document, colours)
+    found = [(row, row.shown_interval, row.shown, row.shown_in) for row in rows]
+    return tuple(found), scale_marks(document), shown_unit(document).axis
 
 
 def _grey(case: Case, states: ImagedStates, after: int | None) -> Grey | None:

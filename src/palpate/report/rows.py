@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from palpate.report.ticks import log_marks, mark_text
+from palpate.report.units import ModulusUnit, shown_unit
 from palpate.uncertainty import NORMAL_95, Interval
 from palpate.unknowns import FIELD, KNOWN_MODULUS
 
@@ -28,13 +30,13 @@ CAUSES = {
     "grid": "the voxels' place",
     "mesh": "the mesh",
 }
-STEPS = ((1.0, 2.0, 5.0), tuple(0.5 * n for n in range(2, 20)), tuple(0.1 * n for n in range(10, 100)))  # of a decade
-FEWEST_MARKS = 3  # on a scale that can be read
+MOST_CAUSES = 4  # of a bar; the smaller ones together are the last
+OTHERS = "others"
 FADING = 0.6  # of a cause's opacity, that of the next one on the bar
 FOUND = {
     "identified": "The images fix the stiffness of {}.",
     "weak": "The stiffness of {} is less sure: use the interval, not the number alone.",
-    "ratio only": "The images fix the stiffness of {} as a ratio to the others, not as a number of kilopascals.",
+    "ratio only": "The images fix the stiffness of {} only as a ratio, not in kilopascals.",
 }
 MISSED = "The fitted model misses some of the data by more than their errors: the interval does not cover that."
 OPEN = "The images do not fix the stiffness of {}: do not use {}."
@@ -65,14 +67,21 @@ class Share:
 
 @dataclass(frozen=True, slots=True)
 class EstimateRow:
-    """One tissue of the result table, all texts; shares: of each cause in the variance of ln E.
+    """One tissue of the result table, all texts; shares: of the largest causes in the variance of ln E, and the rest.
 
-    sources: of each kind of data in what is known of it, where a case has more than images. reference: the modulus of
-    `relative_to`, kPa; expected: how often an error as large as that from the truth comes about, by the interval.
+    shown, shown_interval, shown_in: the number that leads, its interval and its unit, which is the page's; also: the
+    same otherwise, as a sentence. causes: all shares, where `shares` joins some; sources: of each kind of data in what
+    is known of it, where a case has more than images. value, interval, unit: those of the document; reference: the
+    modulus of `relative_to`, kPa; truth: with its unit; expected: how often an error as large as that from the truth
+    comes about, by the interval.
     """
 
     tissue: str
     colour: str
+    shown: str
+    shown_interval: str
+    shown_in: str
+    also: str
     value: str
     interval: str
     unit: str
@@ -87,6 +96,7 @@ class EstimateRow:
     expected: str
     bar: Bar | None
     shares: tuple[Share, ...]
+    causes: str
     sources: tuple[Share, ...]
 
 
@@ -139,36 +149,85 @@ def estimate_rows(document: Mapping[str, Any], colours: Mapping[str, str]) -> tu
 
     `colours`: tissue -> #rrggbb.
     """
-    items = moduli_in(document)
-    shown = document["status"] == "converged"
-    scale = _scale(items) if shown else None
+    items, unit = moduli_in(document), shown_unit(document)
+    found = document["status"] == "converged"
+    scale = _scale(items, unit) if found else None
     rows = []
     for item in items:
-        value, interval = main_numbers(item)
-        truth, shares = item["truth"], item.get("variance_shares") or {}
+        value, interval = unit.numbers(item) if found else (None, None)
+        truth, shares = unit.truth(item), _causes(item, unit) if found else {}
         sources = document.get("information_shares", {}).get(item["tissue"], {}) if document["case"].get("data") else {}
         largest = sorted(sources.items(), key=lambda source: -source[1])
         row = EstimateRow(
             tissue=item["tissue"],
             colour=colours.get(item["tissue"], "#888888"),
-            value=number(item["value"] if shown else None),
-            interval=interval_text(item["interval95"] if shown else None),
+            shown=number(value),
+            shown_interval=interval_text(interval),
+            shown_in=unit.text,
+            also=_also(item, unit) if found else "",
+            value=number(item["value"] if found else None),
+            interval=interval_text(item["interval95"] if found else None),
             unit=item["unit"],
-            ratio=number(item["ratio"] if shown else None),
-            ratio_interval=interval_text(item["ratio_interval95"] if shown else None),
+            ratio=number(item["ratio"] if found else None),
+            ratio_interval=interval_text(item["ratio_interval95"] if found else None),
             relative_to=item["relative_to"],
-            reference=number(item["value"] / item["ratio"] if shown and item["value"] and item["ratio"] else None),
-            verdict=item["verdict"] if shown else "not identified",
+            reference=number(item["value"] / item["ratio"] if found and item["value"] and item["ratio"] else None),
+            verdict=item["verdict"] if found else "not identified",
             why=item["why"],
-            truth=number(truth),
-            error=f"{100.0 * (value / truth - 1.0):+.1f} %" if shown and value and truth else NONE,
-            expected=expected_share(value, interval, truth) if shown and value and truth else NONE,
+            truth=_truth(item, truth, unit),
+            error=f"{100.0 * (value / truth - 1.0):+.1f} %" if value and truth else NONE,
+            expected=expected_share(value, interval, truth) if value and truth else NONE,
             bar=_bar(value, interval, truth=truth, scale=scale) if scale and value and interval else None,
-            shares=_shares({CAUSES.get(cause, cause): share for cause, share in shares.items()}) if shown else (),
-            sources=_shares({BELIEVED if kind == "prior" else kind: share for kind, share in largest}) if shown else (),
+            shares=_shares(_largest(shares)),
+            causes=listed([f"{cause} {_percent(share)}" for cause, share in shares.items()])
+            if len(shares) > MOST_CAUSES
+            else "",
+            sources=_shares({BELIEVED if kind == "prior" else kind: share for kind, share in largest}) if found else (),
         )
         rows.append(row)
     return tuple(rows)
+
+
+def _also(item: Mapping[str, Any], unit: ModulusUnit) -> str:
+    """The number of a row in the unit that does not lead, as a sentence; in kPa it says of which known modulus."""
+    value, ratio, to = item["value"], item["ratio"], item["relative_to"]
+    if value is None or ratio is None:
+        return ""
+    ends = interval_text(item["interval95"])
+    if unit.name == "kPa":
+        between = interval_text(item["ratio_interval95"])
+        return f"{number(ratio)} × {to}{f' ({between})' if between != NONE else ''}"
+    if item["verdict"] != "ratio only":
+        return f"{number(value)} kPa{f' ({ends})' if ends != NONE else ''}"
+    return (
+        f"{number(value)} kPa if {to} has {number(value / ratio)} kPa. The modulus of {to} is known only within a"
+        f" range; over that range {ends} kPa"
+    )
+
+
+def _truth(item: Mapping[str, Any], truth: float | None, unit: ModulusUnit) -> str:
+    """The true modulus with its unit: the one that is shown, else kPa."""
+    if item["truth"] is None:
+        return NONE
+    return f"{number(item['truth'])} kPa" if truth is None else f"{number(truth)} {unit.text}"
+
+
+def _causes(item: Mapping[str, Any], unit: ModulusUnit) -> dict[str, float]:
+    """Share of each cause in the variance of what is shown, the largest first; of ratios without the known modulus."""
+    shares = dict[str, float](item.get("variance_shares") or {})
+    if unit.name == "ratio":
+        shares.pop(KNOWN_MODULUS, None)
+    whole = sum(shares.values()) or 1.0
+    ranked = sorted(shares.items(), key=lambda share: -share[1])
+    return {str(CAUSES.get(cause, cause)): share / whole for cause, share in ranked}
+
+
+def _largest(shares: Mapping[str, float]) -> dict[str, float]:
+    """The largest shares, and the rest of more than `MOST_CAUSES` as one."""
+    if len(shares) <= MOST_CAUSES:
+        return dict(shares)
+    ranked = list(shares.items())
+    return dict(ranked[: MOST_CAUSES - 1]) | {OTHERS: sum(share for _, share in ranked[MOST_CAUSES - 1 :])}
 
 
 def expected_share(value: float, interval: Interval | None, truth: float) -> str:
@@ -186,18 +245,12 @@ def expected_share(value: float, interval: Interval | None, truth: float) -> str
 
 def scale_marks(document: Mapping[str, Any]) -> tuple[tuple[float, str], ...]:
     """Places (0 to BAR) and labels of round numbers on the common scale of the bars."""
-    scale = _scale(moduli_in(document)) if document["status"] == "converged" else None
+    scale = _scale(moduli_in(document), shown_unit(document)) if document["status"] == "converged" else None
     if scale is None:
         return ()
-    decades = range(math.floor(scale[0] / math.log(10.0)), math.ceil(scale[1] / math.log(10.0)) + 1)
-    inside = list[tuple[float, str]]()
-    for steps in STEPS:
-        numbers = [step * 10.0**decade for decade in decades for step in steps]
-        places = [(BAR * (math.log(n) - scale[0]) / (scale[1] - scale[0]), f"{n:.3g}") for n in numbers]
-        inside = [mark for mark in places if 0.04 * BAR <= mark[0] <= 0.96 * BAR]
-        if len(inside) >= FEWEST_MARKS:
-            break
-    return tuple(inside[:: math.ceil(len(inside) / 6) or 1])
+    room = 0.04 * (scale[1] - scale[0])
+    marks = log_marks(math.exp(scale[0] + room), math.exp(scale[1] - room), most=6)
+    return tuple((BAR * (math.log(n) - scale[0]) / (scale[1] - scale[0]), mark_text(n)) for n in marks)
 
 
 def main_numbers(item: Mapping[str, Any]) -> tuple[float | None, Interval | None]:
@@ -219,12 +272,12 @@ def interval_text(interval: Interval | None) -> str:
     return f"> {number(low)}" if high is None else f"{number(low)} to {number(high)}"
 
 
-def _scale(items: Iterable[Mapping[str, Any]]) -> tuple[float, float] | None:
+def _scale(items: Iterable[Mapping[str, Any]], unit: ModulusUnit) -> tuple[float, float] | None:
     """Natural logarithms of the smallest and the largest number to be shown, with room on both sides."""
     numbers: list[float] = []
     for item in items:
-        value, interval = main_numbers(item)
-        numbers += [n for n in (value, item["truth"], *(interval or ())) if n is not None and n > 0.0]
+        value, interval = unit.numbers(item)
+        numbers += [n for n in (value, unit.truth(item), *(interval or ())) if n is not None and n > 0.0]
     if not numbers:
         return None
     low, high = math.log(min(numbers)), math.log(max(numbers))
@@ -232,11 +285,16 @@ def _scale(items: Iterable[Mapping[str, Any]]) -> tuple[float, float] | None:
     return low - room, high + room
 
 
+def _percent(share: float) -> str:
+    """A share of 1 in per cent; one that rounds to nothing is not said to be nothing."""
+    return "under 1 %" if 0.0 < share < 0.005 else f"{100.0 * share:.0f} %"
+
+
 def _shares(parts: Mapping[str, float]) -> tuple[Share, ...]:
     """Parts of 1 by their names, one after the other along a bar."""
     found, place = list[Share](), 0.0
     for number, (name, part) in enumerate(parts.items()):
-        found.append(Share(name, f"{100 * part:.0f} %", place, BAR * part, round(FADING**number, 2)))
+        found.append(Share(name, _percent(part), place, BAR * part, round(FADING**number, 2)))
         place += BAR * part
     return tuple(found)
 

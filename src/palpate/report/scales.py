@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.report.report_data import ReportData
+from palpate.report.ticks import log_marks, mark_text
+from palpate.report.units import shown_unit
 from palpate.study.refusals import LINEAR_RANGE
 
+MOST_TICKS = 6  # of a colour bar whose marks are moduli
 UNSEEN = (0.62, 0.63, 0.66)  # where there is no value
 
 
@@ -69,14 +72,18 @@ def distance_scale(voxel_mm: float) -> Scale:
 
 
 def modulus_scale(data: ReportData) -> Scale:
-    """Young's modulus of the meshed tissues, logarithmic, in the result's unit; raises `ValueError` when none is."""
+    """Young's modulus of the meshed tissues, logarithmic, with marks in the unit that the page shows.
+
+    low, high: in the result's unit. Raises `ValueError` when no tissue has a modulus.
+    """
     values = sorted(tissue.modulus for tissue in data.tissues if tissue.modulus is not None and tissue.modulus > 0)
     if not values:
         raise ValueError("no tissue has a modulus")
-    low, high = values[0], values[-1]
-    room = max((high / low) ** 0.12, 1.15)
-    label = "Young's modulus (kPa)" if data.unit == "kPa" else "Young's modulus (ratio)"
-    return Scale("viridis", low / room, high * room, True, label, tuple((v, f"{v:.3g}") for v in dict.fromkeys(values)))
+    room = max((values[-1] / values[0]) ** 0.12, 1.15)
+    low, high, unit = values[0] / room, values[-1] * room, shown_unit(data.document)
+    marks = log_marks(unit.of_document(low), unit.of_document(high), most=MOST_TICKS)
+    factor = low / unit.of_document(low)
+    return Scale("viridis", low, high, True, unit.axis, tuple((mark * factor, mark_text(mark)) for mark in marks))
 
 
 def angle_scale() -> Scale:

@@ -12,10 +12,11 @@ import matplotlib as mpl
 from markupsafe import escape
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from palpate.images.registration import length_text
 from palpate.report.rows import interval_text, number
+from palpate.report.ticks import MOST, log_marks, mark_text
 
 INK = "#010203"  # stands for the page's text colour, which differs between light and dark pages
 STYLE = {
@@ -57,11 +58,12 @@ def link_url(number: int) -> str:
     return f"palpate-link-{number}-"
 
 
-def mark_decades(axis: Axis) -> None:
-    """1, 2 and 5 of each decade of a logarithmic axis, written plainly."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    axis.set_minor_formatter(NullFormatter())
+def mark_decades(axis: Axis, *, most: int = MOST) -> None:
+    """Round numbers along a logarithmic axis as far as it reaches now, `most` at the most, written plainly."""
+    low, high = sorted(float(end) for end in axis.get_view_interval())
+    axis.set_major_locator(FixedLocator(log_marks(low, high, most=most)))
+    axis.set_major_formatter(FuncFormatter(lambda mark, _: mark_text(mark)))
+    axis.set_minor_locator(NullLocator())
 
 
 def draw_svg(

@@ -11,21 +11,11 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from palpate.report.rows import interval_text, main_numbers, number
+from palpate.report.rows import interval_text, number
 from palpate.report.svg import INK, draw_svg, template_of
+from palpate.report.units import ModulusUnit, shown_unit
+from palpate.study.variations import NAMES, ratio_change
 
-NAMES = {
-    "known_modulus": "modulus of {}",
-    "poisson_ratio": "Poisson's ratio of {}",
-    "segmentation": "surface of {}",
-    "driver_prior": "prior of the drivers' motion",
-    "driver_modes": "modes of the drivers' motion",
-    "frame": "motion of the frame",
-    "law": "material law",
-    "outer_boundary": "outer boundary",
-    "edge_length": "edge length of the mesh",
-    "alignment": "alignment",
-}
 COLOURS = ("#3b7dd8", "#d9822b")  # of what lowers the modulus, and of what raises it
 WIDEST = math.log(4.0)  # of ln E on the axis: what reaches further ends in an arrow
 LEAST = math.log(1.05)
@@ -37,12 +27,13 @@ LETTERS = 34  # of a label
 class TornadoRow:
     """One assumption and what its settings do to one modulus: ln E' / E by setting, in their order.
 
-    method: how they were found; at_bound: settings at which the modulus runs to the bounds of the search; failed:
-    setting -> why there is no estimate.
+    method: how they were found; covered: whether the 95 % interval holds what is not known of it; at_bound: settings
+    at which the modulus runs to the bounds of the search; failed: setting -> why there is no estimate.
     """
 
     label: str
     method: str
+    covered: bool
     effects: Mapping[str, float]
     at_bound: tuple[str, ...]
     failed: Mapping[str, str]
@@ -59,7 +50,11 @@ class TornadoRow:
 
 
 def tornado_rows(document: Mapping[str, Any], tissue: str) -> tuple[TornadoRow, ...]:
-    """Those of one tissue of a document sensitivity.json or result.json, the largest effect first."""
+    """Those of one tissue of a document sensitivity.json or result.json, the largest effect first.
+
+    Where the document's moduli are shown as ratios, so are the effects: ln of a ratio over the estimated one.
+    """
+    unit = shown_unit(document)
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for variation in document["variations"]:
         groups.setdefault((variation["cause"], variation["subject"]), []).append(variation)
@@ -70,7 +65,8 @@ def tornado_rows(document: Mapping[str, Any], tissue: str) -> tuple[TornadoRow, 
             TornadoRow(
                 NAMES.get(cause, cause).format(subject),
                 members[0]["method"],
-                {m["setting"]: m["changes"][tissue] for m in found},
+                is_covered(document, cause, subject),
+                {m["setting"]: _effect(m, tissue, unit) for m in found},
                 tuple(m["setting"] for m in found if tissue in m["at_bound"]),
                 {m["setting"]: m["reason"] for m in members if m["changes"] is None},
             )
@@ -78,28 +74,66 @@ def tornado_rows(document: Mapping[str, Any], tissue: str) -> tuple[TornadoRow, 
     return tuple(sorted(rows, key=lambda row: -row.size))
 
 
+def is_covered(document: Mapping[str, Any], cause: str, subject: str) -> bool:
+    """Whether the 95 % interval of a document's moduli holds what is not known of an assumption.
+
+    It does of unknowns of the estimate with a prior of their own: Poisson's ratios, how surfaces are drawn, a frame
+    that moves, a known modulus that is a range; and of the mesh, by a term of the variance. It does not of the material
+    law, of a known modulus that is a number, of another boundary or alignment, nor of the priors themselves.
+    """
+    case = document["case"]
+    left_out, tissue = case.get("discrepancy", {}), case.get("tissues", {}).get(subject, {})
+    held: dict[str, bool] = {
+        "poisson_ratio": left_out.get("poisson_sd", 0.0) > 0.0,
+        "segmentation": left_out.get("surface_offset_mm", 0.0) > 0.0,
+        "frame": case.get("domain", {}).get("outer_boundary") == "moving",
+        "known_modulus": isinstance(tissue.get("youngs_modulus_kpa"), list | tuple),
+        "edge_length": True,
+    }
+    return held.get(cause, False)
+
+
+def coverage(document: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Assumptions that were varied: those that the 95 % interval holds, and those that it does not hold."""
+    bars = dict.fromkeys((each["cause"], each["subject"]) for each in document.get("variations", ()))
+    named = [(NAMES.get(cause, cause).format(subject), is_covered(document, cause, subject)) for cause, subject in bars]
+    return tuple(name for name, held in named if held), tuple(name for name, held in named if not held)
+
+
+def _effect(variation: Mapping[str, Any], tissue: str, unit: ModulusUnit) -> float:
+    """What a variation does to ln of a tissue's modulus in that unit."""
+    change = float(variation["changes"][tissue])
+    if unit.name == "kPa":
+        return change
+    of = variation["cause"], variation["subject"], variation["setting"]
+    return round(ratio_change(change, *of, relative_to=unit.relative_to), 12) + 0.0
+
+
 def effect_text(row: TornadoRow, *, reasons: bool = False) -> str:
-    """What each setting does, in per cent of the modulus: "0.43: -3 %, 0.47: +4 %".
+    """What each setting does, in per cent of what is shown: "0.43: -3 %, 0.47: +4 %".
 
     Of one without a change "no estimate", or, with `reasons`, why there is none.
     """
     words = []
     for setting, change in row.effects.items():
         end = " (at the search's bound)" if setting in row.at_bound else ""
-        words.append(f"{setting}: {100.0 * math.expm1(change):+.3g} %{end}")
+        words.append(f"{setting}: {f'{100.0 * math.expm1(change):+.3g} %' if change else 'no change'}{end}")
     words += [f"{setting}: {why if reasons else 'no estimate'}" for setting, why in row.failed.items()]
     return ", ".join(words)
 
 
 def sensitivity_table(document: Mapping[str, Any]) -> list[list[str]]:
     """Rows of cells, a heading first: modulus of each tissue, then what changes it, the largest effect first."""
-    rows = [["tissue", "changed", "modulus", "method"]]
+    unit = shown_unit(document)
+    quantity = "modulus" if unit.name == "kPa" else "ratio"
+    rows = [["tissue", "changed", quantity, "method", "in the interval"]]
     for item in document["estimates"]:
-        value, interval = main_numbers(item)
-        unit = "kPa" if item["unit"] == "kPa" else f"x {item['relative_to']}"
-        rows.append([item["tissue"], "-", f"{number(value)} {unit} (95 %: {interval_text(interval)})", ""])
+        value, interval = unit.numbers(item)
+        rows.append([item["tissue"], "-", f"{number(value)} {unit.text} (95 %: {interval_text(interval)})", "", ""])
         found = tornado_rows(document, item["tissue"])
-        rows += [["", row.label, effect_text(row, reasons=True), row.method] for row in found]
+        rows += [
+            ["", row.label, effect_text(row, reasons=True), row.method, "yes" if row.covered else "no"] for row in found
+        ]
     return rows
 
 
@@ -113,7 +147,8 @@ def tornado_svg(document: Mapping[str, Any], tissue: str, *, name: str) -> str:
         raise ValueError("nothing was varied")
     estimate = next(item for item in document["estimates"] if item["tissue"] == tissue)
     reach = min(1.15 * max(rows[0].size, LEAST), WIDEST)
-    value, interval = main_numbers(estimate)
+    unit = shown_unit(document)
+    value, interval = unit.numbers(estimate)
     height = 0.8 + 0.3 * len(rows)
     labels = [row.label if len(row.label) <= LETTERS else f"{row.label[: LETTERS - 3]}..." for row in rows]
     marks = [1.0]  # round ratios within the axis, not closer than a twelfth of it
@@ -143,7 +178,8 @@ def tornado_svg(document: Mapping[str, Any], tissue: str, *, name: str) -> str:
         axes.xaxis.set_major_locator(FixedLocator([math.log(m) for m in marks]))
         axes.xaxis.set_minor_locator(NullLocator())
         axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{math.exp(x):.3g}"))
-        axes.set_xlabel("modulus, times the estimate")
+        changed = "modulus" if unit.name == "kPa" else f"ratio to {unit.relative_to[:LETTERS]}"
+        axes.set_xlabel(f"{changed} / its estimate (no unit)")
         axes.grid(visible=True, axis="x")
 
     listing = "; ".join(f"{row.label}: {effect_text(row)}" for row in rows)
@@ -152,9 +188,9 @@ def tornado_svg(document: Mapping[str, Any], tissue: str, *, name: str) -> str:
 
 def sensitivity_page(document: Mapping[str, Any]) -> str:
     """The page of a document sensitivity.json; all names in it are escaped."""
-    tissues = []
+    tissues, unit = [], shown_unit(document)
     for place, item in enumerate(document["estimates"]):
-        value, interval = main_numbers(item)
+        value, interval = unit.numbers(item)
         tissue, sobol = item["tissue"], document["sobol"]
         indices = []  # name of each input with its first and total index, the largest total first
         if sobol is not None:
@@ -166,11 +202,11 @@ def sensitivity_page(document: Mapping[str, Any]) -> str:
             {
                 "name": tissue,
                 "value": number(value),
-                "unit": "kPa" if item["unit"] == "kPa" else f"× {item['relative_to']}",
+                "unit": unit.text,
                 "interval": interval_text(interval),
                 "chart": Markup(tornado_svg(document, tissue, name=f"tornado{place}")),  # noqa: S704 - ours
                 "rows": [(row, effect_text(row)) for row in tornado_rows(document, tissue)],
                 "sobol": indices,
             }
         )
-    return str(template_of("sensitivity.html").render(document=document, tissues=tissues))
+    return str(template_of("sensitivity.html").render(document=document, tissues=tissues, unit=unit))

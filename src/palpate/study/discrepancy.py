@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from palpate.findings import Finding
 from palpate.images.checks import later_names
 from palpate.inversion import Inversion
+from palpate.mechanics.finite_strain import NEARLY_INCOMPRESSIBLE
 from palpate.mesh.surface import cut_faces
 from palpate.uncertainty import NORMAL_95, FittedState
 from palpate.unknowns import LAYER, in_series
@@ -72,16 +73,32 @@ class LayerFound:
 
 
 @dataclass(frozen=True, slots=True)
+class PoissonRatioFound:
+    """Poisson's ratio of a tissue, dimensionless: as stated, and as fitted beside the moduli, with its sd.
+
+    pair: number of the image pair, from 1; each has its own fit.
+    """
+
+    tissue: str
+    pair: int
+    stated: float
+    fitted: float
+    sd: float
+
+
+@dataclass(frozen=True, slots=True)
 class FoundDiscrepancy:
     """All of it: the frame of each later state (None: it is held), offsets, tissues that are not homogeneous.
 
-    layers: round organs, none where the estimate takes them for their tissue.
+    layers: round organs, none where the estimate takes them for their tissue; poisson_ratios: of tissues whose ratio
+    the case gives, none where that is held.
     """
 
     frame: tuple[FrameFound | None, ...] = ()
     offsets: tuple[OffsetFound, ...] = ()
     heterogeneity: tuple[HeterogeneityFound, ...] = ()
     layers: tuple[LayerFound, ...] = ()
+    poisson_ratios: tuple[PoissonRatioFound, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +135,7 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
     parameters, unknowns = inversion.objective.parameters, inversion.minimum.unknowns
     n = parameters.n_parameters
     offsets, heterogeneity, layers = list[OffsetFound](), list[HeterogeneityFound](), list[LayerFound]()
-    smooth = dict[int, float]()
+    smooth, ratios, pair = dict[int, float](), list[PoissonRatioFound](), 0
     rows = np.linalg.inv(inversion.minimum.evaluation.matrix)
     for number, block in enumerate(parameters.blocks):
         own = parameters.columns(number)
@@ -135,6 +152,15 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
             x, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(rows[own[0], own[0]]))
             low, ratio, high = np.exp([x - half, x, x + half]).tolist()
             layers.append(LayerFound(block.of, ratio, (low, high)))
+        elif block.cause == "poisson":
+            pair += 1
+            model = inversion.objective.states[block.states[0]].model
+            found = zip(model.material.poisson, unknowns[own].tolist(), np.diag(rows)[own].tolist(), strict=True)
+            for group, shift, variance in found:  # the layers of a tissue have its ratio
+                tissue = model.space.mesh.tissues[group[0]]
+                fitted = min(tissue.poisson_ratio + shift, NEARLY_INCOMPRESSIBLE)
+                sd = float(np.sqrt(variance))
+                ratios.append(PoissonRatioFound(tissue.name, pair, tissue.poisson_ratio, fitted, sd))
         elif block.cause == "frame":
             smooth.setdefault(block.states[0], learned * block.unit_mm)
     frames = list[FrameFound | None]([None] * len(states))
@@ -142,7 +168,7 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
         points = np.unique(states[s].space.facets(cut_faces(states[s].space.mesh)))
         motion = np.linalg.norm(states[s].displacement[points], axis=1) if len(points) else np.zeros(1)
         frames[s] = FrameFound(float(np.sqrt(np.mean(motion**2))), float(motion.max()), prior_mm)
-    return FoundDiscrepancy(tuple(frames), tuple(offsets), tuple(heterogeneity), tuple(layers))
+    return FoundDiscrepancy(tuple(frames), tuple(offsets), tuple(heterogeneity), tuple(layers), tuple(ratios))
 
 
 def discrepancy_findings(found: FoundDiscrepancy) -> tuple[Finding, ...]:

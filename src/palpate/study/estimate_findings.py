@@ -12,7 +12,9 @@ from palpate.images.checks import later_names
 from palpate.inversion import Inversion, Outcome
 from palpate.mechanics.element import deformation_determinants
 from palpate.observation.contract import OfInstrument
+from palpate.study.estimated import ModulusEstimate
 from palpate.study.together import ImagePairs
+from palpate.study.variations import NAMES, Variation, ratio_change
 from palpate.uncertainty import FittedState
 
 STRONG_CORRELATION = 0.99
@@ -142,3 +144,44 @@ def fold_findings(states: Sequence[FittedState]) -> tuple[Finding, ...]:
                 )
             )
     return tuple(findings)
+
+
+def variation_findings(variations: Sequence[Variation], estimates: Sequence[ModulusEstimate]) -> tuple[Finding, ...]:
+    """A finding for each assumption that takes a modulus out of its 95 % interval, with the farthest of its settings.
+
+    What is known as a ratio alone is compared as a ratio.
+    """
+    findings = []
+    for cause, subject in dict.fromkeys((variation.cause, variation.subject) for variation in variations):
+        label = NAMES.get(cause, cause).format(subject)
+        settings = [v for v in variations if (v.cause, v.subject) == (cause, subject)]
+        for of in estimates:
+            if words := _farthest_outside(settings, of):
+                setting, moved = words
+                text = (
+                    "an assumption weighs more than the 95 % interval: state it with the result."
+                    f" {label[0].upper()}{label[1:]}, {setting}: {moved}"
+                )
+                findings.append(Finding("beyond-interval", text, about=label, place=moved))
+    return tuple(findings)
+
+
+def _farthest_outside(settings: Sequence[Variation], of: ModulusEstimate) -> tuple[str, str] | None:
+    """Setting that moves a modulus farthest out of its interval, and where to, in words; None where none does."""
+    in_kpa = of.value is not None and of.verdict != "ratio only"
+    value, interval = (of.value, of.interval95) if in_kpa else (of.ratio, of.ratio_interval95)
+    if not value or interval is None:
+        return None
+    found, farthest = None, 0.0
+    for each in settings:
+        change = (each.changes or {}).get(of.tissue, 0.0)
+        if not in_kpa:
+            change = ratio_change(change, each.cause, each.subject, each.setting, relative_to=of.relative_to)
+        end = interval[0 if change < 0.0 else 1]
+        outside = 0.0 if end is None else abs(change) - abs(float(np.log(end / value)))
+        if outside > farthest:
+            ends = " to ".join("open" if end is None else f"{end:.3g}" for end in interval)
+            unit = "kPa" if in_kpa else f"x {of.relative_to}"
+            moved = f"'{of.tissue}' would have {value * np.exp(change):.3g} {unit}, outside {ends}"
+            found, farthest = (each.setting, moved), outside
+    return found

@@ -14,8 +14,9 @@ from palpate.progress import Line, Progress
 from palpate.study.body import Body, joint_problem, on_linear_elements
 from palpate.study.case import Case, Mechanics
 from palpate.study.run import inversion_settings
-from palpate.study.verdicts import verdict
+from palpate.study.verdicts import or_as_ratio, verdict, without_scale
 from palpate.uncertainty import Interval, covariance_of, error_noise, log_interval, sandwich_covariance
+from palpate.unknowns import KNOWN_MODULUS
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +25,7 @@ class PredictedModulus:
 
     interval95: what would be left of it with all that is unknown; an open end (None) reaches beyond the bounds of the
     search; verdict: that which an estimate with this interval would have; shares: of each cause in the variance of
-    ln E.
+    ln E; ratio, ratio_interval95: to `relative_to`, where the modulus of that is a range.
     """
 
     tissue: str
@@ -35,6 +36,8 @@ class PredictedModulus:
     verdict: str
     why: str
     shares: Mapping[str, float] = field(default_factory=dict)
+    ratio: float | None = None
+    ratio_interval95: Interval | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +58,11 @@ class Prediction:
         lines = []
         for of in self.moduli:
             unit = "kPa" if of.unit == "kPa" else f"times {of.relative_to}"
-            ends = " to ".join("–" if end is None else f"{end:.3g}" for end in of.interval95)
-            guess = f"predicted for {of.tissue}, if it has {of.guess:.3g} {unit}"
+            value, interval = of.guess, of.interval95
+            if of.verdict == "ratio only" and of.ratio is not None and of.ratio_interval95 is not None:
+                value, interval, unit = of.ratio, of.ratio_interval95, f"times {of.relative_to}"
+            ends = " to ".join("–" if end is None else f"{end:.3g}" for end in interval)
+            guess = f"predicted for {of.tissue}, if it has {value:.3g} {unit}"
             lines.append(f"{guess}: 95 % interval {ends} {unit} ({of.verdict})")
         return lines
 
@@ -75,6 +81,8 @@ class Prediction:
                     "guess": of.guess,
                     "interval95": list(of.interval95),
                     "relative_to": of.relative_to,
+                    "ratio": of.ratio,
+                    "ratio_interval95": of.ratio_interval95 and list(of.ratio_interval95),
                     "verdict": of.verdict,
                     "shares": dict(of.shares),
                 }
@@ -119,6 +127,11 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
         interval = log_interval(value, sd, **limits)
         word, why = verdict(interval, at_bound=False, absolute=mapping.absolute)
         unit = mapping.scale_kpa if mapping.absolute else 1.0
+        shares = replace(found, mesh=np.zeros_like(found.mesh)).shares(i)
+        of_scale, as_ratio = sd * float(np.sqrt(shares.get(KNOWN_MODULUS, 0.0))), None
+        if of_scale > 0.0:
+            as_ratio = without_scale(of_scale, interval, value, centre=value)
+            word, why = or_as_ratio((word, why), as_ratio, at_bound=False)
         ends = (interval[0] and unit * interval[0], interval[1] and unit * interval[1])
         moduli.append(
             PredictedModulus(
@@ -129,7 +142,9 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
                 mapping.relative_to,
                 word,
                 why,
-                replace(found, mesh=np.zeros_like(found.mesh)).shares(i),
+                shares,
+                value if as_ratio else None,
+                as_ratio,
             )
         )
     return Prediction(

@@ -416,4 +416,5 @@ def _discrepancy(found: FoundDiscrepancy, names: Sequence[str]) -> dict[str, Any
         ],
         "heterogeneity": [_plain(of) for of in found.heterogeneity],
         "layers": [_plain(of) for of in found.layers],
+        "poisson_ratios": [_plain(of) for of in found.poisson_ratios],
     }

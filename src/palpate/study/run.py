@@ -21,6 +21,7 @@ from palpate.study.case import SOUGHT_RATIOS, Case, Mechanics
 from palpate.study.case_body import LAW_NAMES
 from palpate.study.case_loads import load_warnings
 from palpate.study.cost import ExpectedCost, expected_cost, refuse_lack
+from palpate.study.estimate_findings import variation_findings
 from palpate.study.estimated import Estimation
 from palpate.study.estimation import Observed, conclude
 from palpate.study.imaged import ImagedStates
@@ -114,7 +115,9 @@ def estimate_states(
     )
     if inversion.minimum.converged:
         stating("what would change the answer: surfaces, constants, frame and law, one after the other")
-        estimation = replace(estimation, variations=_what_would_change(inversion, settings, case, bodies))
+        variations = _what_would_change(inversion, settings, case, bodies)
+        remarks = (*estimation.remarks, *variation_findings(variations, estimation.estimates))
+        estimation = replace(estimation, variations=variations, remarks=remarks)
     clock.append(time.perf_counter())
     stages = np.diff(clock)
     seconds = {"read": read_seconds, "mesh": stages[0], "assemble": stages[1], "estimate": stages[2]}

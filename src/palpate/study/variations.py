@@ -32,6 +32,19 @@ from palpate.uncertainty import (
 
 POISSON_STEP = 0.02
 KNOWN_FACTOR = 1.2
+DOWN, UP = f"/ {KNOWN_FACTOR:g}", f"x {KNOWN_FACTOR:g}"  # settings of a known modulus
+NAMES = {  # of a bar, by its cause; {} is the tissue
+    "known_modulus": "modulus of {}",
+    "poisson_ratio": "Poisson's ratio of {}",
+    "segmentation": "surface of {}",
+    "driver_prior": "prior of the drivers' motion",
+    "driver_modes": "modes of the drivers' motion",
+    "frame": "motion of the frame",
+    "law": "material law",
+    "outer_boundary": "outer boundary",
+    "edge_length": "edge length of the mesh",
+    "alignment": "alignment",
+}
 VOXELS = (-0.5, -0.25, 0.25, 0.5)
 PRIOR_WIDTHS = (0.5, 2.0)
 ALL = "all tissues"
@@ -54,6 +67,16 @@ class Variation:
     at_bound: tuple[str, ...] = ()
     reason: str = ""
     seconds: float = 0.0
+
+
+def ratio_change(change: float, cause: str, subject: str, setting: str, *, relative_to: str) -> float:
+    """Change of ln (E / E_known), dimensionless, by a variation that changes ln E by `change`.
+
+    Where the known modulus itself is varied, E_known changes by a factor of 1.2 as well.
+    """
+    if cause != "known_modulus" or subject != relative_to:
+        return change
+    return change + float(np.log(KNOWN_FACTOR)) * {DOWN: 1.0, UP: -1.0}[setting]
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,7 +299,7 @@ def _inputs(
     if not _exact(inversion, tissues):
         by_modulus = modulus_errors(objective, minimum.unknowns, minimum.evaluation)
         step = float(np.log(KNOWN_FACTOR))
-        amounts = ((-step, f"/ {KNOWN_FACTOR:g}"), (step, f"x {KNOWN_FACTOR:g}"))
+        amounts = ((-step, DOWN), (step, UP))
         found += [
             _Input("known_modulus", name, "ln E", tuple(e[:, own].sum(axis=1) for e in by_modulus), amounts)
             for name, own in numbers.items()
@@ -306,7 +329,7 @@ def _exact(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Variation]
     step = float(np.log(KNOWN_FACTOR))
     return [
         Variation("known_modulus", known[0], words, "exact", dict.fromkeys(mapping.tissues, sign * step))
-        for sign, words in ((-1.0, f"/ {KNOWN_FACTOR:g}"), (1.0, f"x {KNOWN_FACTOR:g}"))
+        for sign, words in ((-1.0, DOWN), (1.0, UP))
     ]
 
 

@@ -125,15 +125,11 @@ def estimates_of(
         theta, (low, high) = float(inversion.minimum.unknowns[i]), of.interval
         value, shares = float(np.exp(theta)), covariance.shares(i)
         of_scale = float(np.sqrt(shares.get(KNOWN_MODULUS, 0.0) * covariance.total[i, i]))
-        by_ratio = _without(of_scale, of.interval, value, centre=float(np.exp(theta - shift)))
+        by_ratio = without_scale(of_scale, of.interval, value, centre=float(np.exp(theta - shift)))
         word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
         why = why if of.followed or of.at_bound else NOT_FOLLOWED
-        if word != "identified" and of_scale > 0.0:
-            # the ratio may be known better than the modulus, where the scale is a range
-            ratio_word, ratio_why = verdict(by_ratio, at_bound=of.at_bound, absolute=True)
-            if ratio_word not in (NOT_IDENTIFIED, word):
-                left = "the range of the known modulus leaves more of it open in kPa"
-                word, why = "ratio only", f"of the ratio {ratio_why}; {left}"
+        if of_scale > 0.0:
+            word, why = or_as_ratio((word, why), by_ratio, at_bound=of.at_bound)
         if inversion.unsettled and word != NOT_IDENTIFIED:
             word = "weak" if word == "identified" else word
             why = f"{why}, but does not hold what layers round the organs would do (warning `unsettled`)"
@@ -158,7 +154,18 @@ def estimates_of(
     return tuple(found)
 
 
-def _without(sd: float, interval: Interval, value: float, *, centre: float) -> Interval:
+def or_as_ratio(found: tuple[str, str], by_ratio: Interval, *, at_bound: bool) -> tuple[str, str]:
+    """Verdict and reason of a modulus whose scale is known only within a range: its ratio may say more.
+
+    found: those of the modulus in kPa, which stay where its ratio says no more.
+    """
+    ratio_word, ratio_why = verdict(by_ratio, at_bound=at_bound, absolute=True)
+    if found[0] == "identified" or ratio_word in (NOT_IDENTIFIED, found[0]):
+        return found
+    return "ratio only", f"of the ratio {ratio_why}; the range of the known modulus leaves more of it open in kPa"
+
+
+def without_scale(sd: float, interval: Interval, value: float, *, centre: float) -> Interval:
     """An interval about another centre, with the half-widths in ln reduced by an independent cause.
 
     sd: that of the cause, in ln; h -> sqrt(h^2 - (1.96 sd)^2).

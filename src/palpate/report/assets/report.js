@@ -104,12 +104,12 @@ Palpate.theme = () => {
   });
 };
 
-// A slider that fades from one image to the other, and a button that moves it to and fro.
+// A slider that fades from one image to the other, and a button that moves it forth and back.
 Palpate.play = (figure, on) => {
   clearInterval(figure.timer);
   figure.timer = 0;
   figure.button.setAttribute("aria-pressed", String(on));
-  figure.button.textContent = on ? "Stop" : "Fade to and fro";
+  figure.button.textContent = on ? "Stop" : "Play the change";
   if (!on) return;
   const begin = performance.now() - (3000 / Math.PI) * Math.acos(1 - Number(figure.fade.value) / 50);
   figure.timer = setInterval(() => { // in three seconds, with a rest at both ends

@@ -1,0 +1,128 @@
+"""Every axis of every chart says what it shows in which unit, and nothing of it is cut off or hides another part."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from itertools import pairwise
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from palpate.cohort import charts as cohort_charts
+from palpate.report import charts, tornado
+from palpate.report.collect import collect
+from palpate.report.svg import STYLE
+from palpate.study.together import ImagePairs, ModulusRegion, PairAlone
+from palpate.study.variations import Variation
+
+TURN = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+EDGE = tuple((58.9 * math.exp(0.4 * math.cos(t)), 31.2 * math.exp(0.5 * math.sin(t))) for t in TURN.tolist())
+
+
+def drawn(monkeypatch, module, draw) -> Figure:
+    """The figure that a chart paints, before it becomes text."""
+    figures = []
+
+    def keep(paint, *, size, **_):
+        with mpl.rc_context(STYLE):
+            figure = Figure(figsize=size)
+            FigureCanvasAgg(figure)
+            paint(figure)
+            figure.canvas.draw()
+        figures.append(figure)
+        return ""
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "draw_svg", keep)
+        draw()
+    return figures[0]
+
+
+def data_in(case_result, unit):
+    """The report's data with every chart in it, in kPa or as ratios to a tissue whose modulus is a range."""
+    first, second = case_result.estimation.estimates
+    changes = {"profile": ((40.0, -2.5), (58.9, 0.0), (75.0, 1.96))}
+    if unit == "ratio":
+        changes |= {"verdict": "ratio only", "ratio": 5.89, "ratio_interval95": (4.9, 7.1)}
+    alone = PairAlone({"prostate": 55.0}, {"prostate": (40.0, 80.0)}, False, {}, {})
+    estimation = dataclasses.replace(
+        case_result.estimation,
+        estimates=(dataclasses.replace(first, **changes), second),
+        regions=(ModulusRegion(("prostate", "bladder"), EDGE, EDGE, open=False),),
+        image_pairs=ImagePairs((alone, alone), 0.5, {}, {"prostate": 56.0}, {"prostate": (50.0, 63.0)}),
+        variations=(Variation("law", "", "linear", "linearised", {"prostate": 0.2, "bladder": -0.1}),),
+    )
+    return collect(dataclasses.replace(case_result, estimation=estimation))
+
+
+CHARTS = {
+    "profile": lambda data: charts.profile_svg(data, 0, name="a"),
+    "region": lambda data: charts.region_svg(data, 0, name="a"),
+    "repeats": lambda data: charts.repeats_svg(data, 0, name="a"),
+    "modulus": lambda data: charts.modulus_svg(data, 0, name="a"),
+    "misfit": lambda data: charts.objective_svg(data, name="a"),
+    "waterfall": lambda data: charts.waterfall_svg(data, name="a"),
+    "angles": lambda data: charts.angle_svg(data.mesh.angles, name="a"),
+    "residuals": lambda data: charts.residual_svg(data, data.later[0].model[0], voxel_mm=1.0, name="a"),
+    "tornado": lambda data: tornado.tornado_svg(data.document, "prostate", name="a"),
+}
+
+
+def assert_readable(figure, *, categories=()):
+    canvas = figure.canvas.get_renderer()
+    whole = figure.bbox
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            label = axis.label.get_text()
+            if axis.axis_name not in categories:
+                assert label.endswith(")"), label
+                assert "(" in label
+                box = axis.label.get_window_extent(canvas)
+                assert whole.x0 <= box.x0 < box.x1 <= whole.x1, label
+                assert whole.y0 <= box.y0 < box.y1 <= whole.y1, label
+            low, high = axis.get_view_interval()
+            texts = [
+                t for at, t in zip(axis.get_majorticklocs(), axis.get_ticklabels(), strict=True) if low <= at <= high
+            ]
+            boxes = [text.get_window_extent(canvas) for text in texts if text.get_text()]
+            assert all("$" not in text.get_text() and "e" not in text.get_text() for text in texts) or categories
+            ends = sorted((b.x0, b.x1) if axis.axis_name == "x" else (b.y0, b.y1) for b in boxes)
+            assert all(one[1] <= other[0] + 0.5 for one, other in pairwise(ends)), label
+            assert not any(text.get_text() for text in axis.get_ticklabels(minor=True))
+
+
+@pytest.mark.parametrize("unit", ["kPa", "ratio"])
+@pytest.mark.parametrize("chart", CHARTS)
+def test_every_axis_of_the_report_has_its_unit_and_marks_apart(case_result, monkeypatch, chart, unit):
+    data = data_in(case_result, unit)
+    module = tornado if chart == "tornado" else charts
+    figure = drawn(monkeypatch, module, lambda: CHARTS[chart](data))
+    assert_readable(figure, categories=("y",) if chart == "tornado" else ())
+    labels = " ".join(axis.label.get_text() for axes in figure.axes for axis in (axes.xaxis, axes.yaxis))
+    if chart in ("profile", "region", "repeats", "modulus"):
+        assert ("kPa" in labels) == (unit == "kPa")
+        assert ("of surroundings (ratio)" in labels) == (unit == "ratio")
+
+
+@pytest.mark.parametrize("unit", ["kPa", "ratio"])
+def test_every_axis_of_a_cohort_has_its_unit_and_marks_apart(monkeypatch, unit):
+    found = {"value": 20.0, "low95": 12.0, "high95": 33.0}
+    summary = {"organ": {"median": 20.0, "combined": found, "censored": [[15.0, None]]}}
+    values = {"kpa" if unit == "kPa" else "ratio": {"organ": [18.0, 20.0, 25.0]}}
+    patients = [
+        {"patient": f"P{i}", "stage": 1 + i % 3, "summary": summary, "kpa": {}, "ratio": {}} | values for i in range(6)
+    ]
+    line = {"factor_per_stage": 1.2, "at_mean_stage": 20.0, "mean_stage": 2.0}
+    for draw, categories in (
+        (lambda: cohort_charts.boxes_svg(patients, "organ", unit, name="a", pages={}), ("x",)),
+        (lambda: cohort_charts.scatter_svg(patients, "organ", unit, line, name="a", pages={}), ()),
+        (lambda: cohort_charts.forest_svg(patients, "organ", unit, name="a", pages={}), ("y",)),
+    ):
+        figure = drawn(monkeypatch, cohort_charts, draw)
+        assert_readable(figure, categories=categories)
+        words = [axis.label.get_text() for axis in (figure.axes[0].xaxis, figure.axes[0].yaxis)]
+        assert any(f"({unit})" in word for word in words)
