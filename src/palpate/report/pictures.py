@@ -12,7 +12,7 @@ from palpate.mesh import outer_faces
 from palpate.mesh.surface import triangle_normals, vertex_normals
 from palpate.report.render import Arrows, Camera, Triangles, render_png
 from palpate.report.report_data import LaterImage, MeasuredState, MeshPicture, ReportData
-from palpate.report.scales import distance_scale, modulus_scale, strain_scale
+from palpate.report.scales import distance_scale, modulus_scale, shown_moduli, strain_scale
 
 WIDTH, HEIGHT = 620, 460
 BESIDE = Camera.looking((-1.0, 0.3, 0.15))  # the patient's left side, a little from the front
@@ -72,8 +72,7 @@ def mesh_png(data: ReportData, *, by: Literal["tissue", "modulus", "strain"]) ->
     if by == "strain":
         shades = strain_scale().colours(100.0 * mesh.strains[tets].astype(np.float64))
     elif by == "modulus":
-        moduli = [np.nan if tissue.modulus is None else tissue.modulus for tissue in data.tissues]
-        shades = modulus_scale(data).colours(np.array(moduli, dtype=np.float64))[mesh.region[tets]]
+        shades = modulus_scale(data).colours(shown_moduli(data))[mesh.region[tets]]
     else:
         shades = np.array([to_rgb(tissue.colour) for tissue in data.tissues])[mesh.region[tets]]
     corners = mesh.nodes.astype(np.float64)[faces]

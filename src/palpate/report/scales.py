@@ -7,10 +7,13 @@ from dataclasses import dataclass
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from palpate.report.report_data import ReportData
+from palpate.report.report_data import LaterImage, ReportData
+from palpate.report.rows import moduli_in
 from palpate.study.refusals import LINEAR_RANGE
+from palpate.study.stiffness_scale import COLOURS, StiffnessScale, stiffness_scale
 
 UNSEEN = (0.62, 0.63, 0.66)  # where there is no value
 
@@ -69,14 +72,37 @@ def distance_scale(voxel_mm: float) -> Scale:
 
 
 def modulus_scale(data: ReportData) -> Scale:
-    """Young's modulus of the meshed tissues, logarithmic, in the result's unit; raises `ValueError` when none is."""
-    values = sorted(tissue.modulus for tissue in data.tissues if tissue.modulus is not None and tissue.modulus > 0)
-    if not values:
-        raise ValueError("no tissue has a modulus")
-    low, high = values[0], values[-1]
-    room = max((high / low) ** 0.12, 1.15)
-    label = "Young's modulus (kPa)" if data.unit == "kPa" else "Young's modulus (ratio)"
-    return Scale("viridis", low / room, high * room, True, label, tuple((v, f"{v:.3g}") for v in dict.fromkeys(values)))
+    """Young's modulus of the meshed tissues, logarithmic, in the unit that is shown; raises `ValueError` for none."""
+    of = shown_stiffness(data)
+    return Scale(COLOURS, of.low, of.high, True, of.label, tuple((value, f"{value:.3g}") for value in of.values))
+
+
+def shown_stiffness(data: ReportData) -> StiffnessScale:
+    """In which unit and between which limits moduli are shown; raises `ValueError` where no tissue has one."""
+    items = moduli_in(data.document)
+    return stiffness_scale(
+        [tissue.modulus for tissue in data.tissues],
+        [tissue.name for tissue in data.tissues],
+        unit=data.unit,
+        relative_to=next((item["relative_to"] for item in items), ""),
+        verdicts=[item["verdict"] for item in items],
+    )
+
+
+def shown_moduli(data: ReportData) -> NDArray[np.float64]:
+    """Young's modulus (n_tissues,) of each tissue in the unit of `modulus_scale`; NaN where there is none."""
+    moduli = np.array([np.nan if tissue.modulus is None else tissue.modulus for tissue in data.tissues])
+    return np.asarray(shown_stiffness(data).factor * moduli.astype(np.float64))
+
+
+def displacement_scale(later: LaterImage) -> Scale:
+    """Length of the fitted motion to a later image, from 0 to a round number of mm that nothing exceeds by much."""
+    lengths = np.linalg.norm(later.motion.astype(np.float64), axis=1)
+    top = float(np.percentile(lengths, 99.9)) if len(lengths) else 0.0
+    ticks = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, max(top, 1e-3))
+    return Scale(
+        "plasma", 0.0, float(ticks[-1]), False, "fitted motion (mm)", tuple((t, f"{t:g}") for t in ticks.tolist())
+    )
 
 
 def angle_scale() -> Scale:

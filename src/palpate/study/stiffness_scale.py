@@ -1,0 +1,67 @@
+"""How Young's modulus is shown in colours: the unit, the limits and the colours that every picture of a case shares."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import matplotlib as mpl
+import numpy as np
+from numpy.typing import NDArray
+
+COLOURS = "viridis"  # matplotlib's map: its brightness rises evenly, and it does not rest on red and green
+ROOM = 0.12  # of the logarithmic range, left free at both ends
+LEAST_ROOM = 1.15  # the factor that is left free at both ends at least
+RATIO_ONLY = "ratio only"  # the verdict on a modulus whose scale is not known
+
+
+@dataclass(frozen=True, slots=True)
+class StiffnessScale:
+    """A logarithmic scale of colours from `low` to `high`, in `unit`: "kPa", or "ratio" to the tissue `relative_to`.
+
+    factor: what a modulus in the result's unit is multiplied by to be shown, dimensionless; values: the moduli of the
+    tissues that are shown, each once, from the lowest up.
+    """
+
+    unit: str
+    relative_to: str
+    factor: float
+    low: float
+    high: float
+    values: tuple[float, ...]
+
+    @property
+    def label(self) -> str:
+        """What stands beside the colours."""
+        if self.unit == "kPa":
+            return "Young's modulus (kPa)"
+        return f"Young's modulus (ratio to {self.relative_to})" if self.relative_to else "Young's modulus (ratio)"
+
+    def linear_table(self) -> NDArray[np.float64]:
+        """256 colours (256, 3), 0 to 1, at equal steps of the modulus from `low` to `high`.
+
+        This is the table of a program that spreads colours linearly over its window.
+        """
+        values = np.linspace(self.low, self.high, 256)
+        place = np.log(values / self.low) / math.log(self.high / self.low)
+        return np.asarray(mpl.colormaps[COLOURS](place)[:, :3])
+
+
+def stiffness_scale(
+    moduli: Sequence[float | None], names: Sequence[str], *, unit: str, relative_to: str, verdicts: Sequence[str]
+) -> StiffnessScale:
+    """The scale of the moduli of tissues with these `names`, in `unit`, of which some may be None or NaN.
+
+    Where a verdict is `ratio only`, the kilopascals rest on a modulus that is not known: ratios to `relative_to` are
+    shown. Raises `ValueError` where no tissue has a modulus.
+    """
+    found = {name: value for name, value in zip(names, moduli, strict=True) if value and value > 0.0}
+    if not found:
+        raise ValueError("no tissue has a modulus")
+    factor = 1.0
+    if unit == "kPa" and RATIO_ONLY in verdicts and relative_to in found:
+        unit, factor = "ratio", 1.0 / found[relative_to]
+    values = tuple(sorted({factor * value for value in found.values()}))
+    room = max((values[-1] / values[0]) ** ROOM, LEAST_ROOM)
+    return StiffnessScale(unit, relative_to, factor, values[0] / room, values[-1] * room, values)
