@@ -16,19 +16,13 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import tissue_colours
 from palpate.mesh.locate import modulus_image
 from palpate.study.outputs import write_json
-from palpate.study.stiffness_scale import stiffness_scale
+from palpate.study.stiffness_scale import StiffnessScale, stiffness_scale
 
 
 def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write load_in_slicer.py, labels.nii.gz and .csv, stiffness.nii.gz, the surfaces (.ply), the warp, scene.json."""
     write_labels(Segmentation(body.index, body.grid, body.tissues), folder)
-    scale = stiffness_scale(
-        model.moduli.tolist(),
-        [tissue.name for tissue in model.tissues],
-        unit=model.unit,
-        relative_to=model.relative_to,
-        verdicts=[item.verdict for item in model.estimates],
-    )
+    scale = shown_scale(model)
     stiffness = modulus_image(body.mesh, body.grid, scale.factor * model.moduli)
     write_scalar_image(folder / "stiffness.nii.gz", stiffness, body.grid)
     write_ply(model, body, folder)
@@ -57,3 +51,12 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     }
     write_json(folder / "scene.json", scene)
     write_script(folder / "load_in_slicer.py")
+
+
+def shown_scale(model: FittedModel) -> StiffnessScale:
+    """The colours of the stiffness: those of the report, in ratios where a modulus is known as a ratio alone."""
+    unit, factor = model.unit, 1.0
+    ratios = (item.value / item.ratio for item in model.estimates if item.value and item.ratio)
+    if unit == "kPa" and any(item.verdict == "ratio only" for item in model.estimates):
+        unit, factor = "ratio", 1.0 / next(ratios, 1.0)
+    return stiffness_scale(model.moduli.tolist(), unit=unit, relative_to=model.relative_to, factor=factor)

@@ -21,8 +21,11 @@ BESIDE_FRONT = Camera.looking((-1.0, 0.6, 0.35))
 SEEN, FITTED = ("#c98b00", 4.0), ("#1f6fd6", 2.0)  # colour of arrows, and how many pixels thick
 
 
-def organs_png(data: ReportData, later: LaterImage, *, fitted: bool) -> bytes:
-    """The model's organs, as fitted to `later` or at rest, coloured by their signed distance to that image; PNG."""
+def organs_png(data: ReportData, later: LaterImage, *, fitted: bool, size: tuple[int, int] | None = None) -> bytes:
+    """The model's organs, as fitted to `later` or at rest, coloured by their signed distance to that image; PNG.
+
+    size: its width and height in pixels; None: those of the page.
+    """
     if not later.model:
         raise ValueError("there is no fitted model")
     scale = distance_scale(data.references[later.reference].voxel_mm)
@@ -34,7 +37,8 @@ def organs_png(data: ReportData, later: LaterImage, *, fitted: bool) -> bytes:
         colours.append(scale.colours(distance)[model.triangles])
         normals.append(vertex_normals(points, model.triangles.astype(np.int64))[model.triangles])
     triangles = Triangles(np.concatenate(corners), np.concatenate(colours), np.concatenate(normals))
-    return render_png(triangles, BESIDE, width=WIDTH, height=HEIGHT)
+    width, height = size or (WIDTH, HEIGHT)
+    return render_png(triangles, BESIDE, width=width, height=height)
 
 
 def points_png(data: ReportData, state: MeasuredState) -> bytes:

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from palpate.report.report_data import LaterImage, ReportData
-from palpate.report.rows import moduli_in
+from palpate.report.units import shown_unit
 from palpate.study.refusals import LINEAR_RANGE
 from palpate.study.stiffness_scale import COLOURS, StiffnessScale, stiffness_scale
 
@@ -79,14 +79,8 @@ def modulus_scale(data: ReportData) -> Scale:
 
 def shown_stiffness(data: ReportData) -> StiffnessScale:
     """In which unit and between which limits moduli are shown; raises `ValueError` where no tissue has one."""
-    items = moduli_in(data.document)
-    return stiffness_scale(
-        [tissue.modulus for tissue in data.tissues],
-        [tissue.name for tissue in data.tissues],
-        unit=data.unit,
-        relative_to=next((item["relative_to"] for item in items), ""),
-        verdicts=[item["verdict"] for item in items],
-    )
+    unit, moduli = shown_unit(data.document), [tissue.modulus for tissue in data.tissues]
+    return stiffness_scale(moduli, unit=unit.name, relative_to=unit.relative_to, factor=unit.of_document(1.0))
 
 
 def shown_moduli(data: ReportData) -> NDArray[np.float64]:

@@ -77,7 +77,9 @@ def stiffness_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: st
 
     Raises `ValueError` where there is no mesh of this image, or no modulus.
     """
-    scale, values = modulus_scale(data), stiffness_on(data, plane, later)
+    if later.reference:
+        raise ValueError("the mesh that is kept is that of the first pair of images")
+    scale, values = modulus_scale(data), stiffness_on(data, plane)
 
     def draw(figure: Figure) -> None:
         """Grey values under colours, contours and furniture."""
@@ -115,13 +117,11 @@ def displacement_svg(data: ReportData, plane: Plane, later: LaterImage, *, name:
     return draw_svg(draw, size=_size(plane), name=name, says=f"{says} {scale.high:.3g} mm.")
 
 
-def stiffness_on(data: ReportData, plane: Plane, later: LaterImage) -> NDArray[np.float64]:
+def stiffness_on(data: ReportData, plane: Plane) -> NDArray[np.float64]:
     """Young's modulus (n_up, n_across) of what was estimated, in the unit that is shown, on a plane; NaN elsewhere.
 
-    Raises `ValueError` where the mesh is that of another reference state.
+    The plane is one of the first reference state. Raises `ValueError` where there is no mesh or no modulus.
     """
-    if later.reference:
-        raise ValueError("the mesh that is kept is that of the first pair of images")
     return cut_mesh(data, plane).of_elements(element_moduli(data))
 
 
@@ -136,8 +136,11 @@ def arrow_factor(later: LaterImage) -> float:
     return nice_factor(lengths[lengths > 0.0] if (lengths > 0.0).any() else lengths, ARROW_REACH * ARROW_STEP_MM)
 
 
-def motion_arrows(axes: Axes, plane: Plane, motion: NDArray[np.float64], factor: float) -> None:
-    """Arrows of a motion (n_up, n_across, 3) mm on a plane, one every `ARROW_STEP_MM`, `factor` times as long."""
+def motion_arrows(axes: Axes, plane: Plane, motion: NDArray[np.float64], factor: float, *, small: bool = False) -> None:
+    """Arrows of a motion (n_up, n_across, 3) mm on a plane, one every `ARROW_STEP_MM`, `factor` times as long.
+
+    small: thinner ones, in a figure for paper.
+    """
     across, up = plane.axes
     step = max(round(ARROW_STEP_MM / float(across[1] - across[0])), 1)
     rows, columns = np.meshgrid(*(np.arange(step // 2, n, step) for n in motion.shape[:2]), indexing="ij")
@@ -145,8 +148,8 @@ def motion_arrows(axes: Axes, plane: Plane, motion: NDArray[np.float64], factor:
     inside = factor * np.linalg.norm(np.nan_to_num(way), axis=2) > LEAST_ARROW_MM
     feet = np.zeros((int(inside.sum()), 3))
     feet[:, plane.view.across], feet[:, plane.view.up] = across[columns[inside]], up[rows[inside]]
-    for style in (("#000000", 0.028), ("#ffffff", 0.014)):  # white arrows with a dark rim
-        _arrows(axes, plane, feet, factor * way[inside], style, "layer-motion")
+    for colour, width in (("#000000", 0.028), ("#ffffff", 0.014)):  # white arrows with a dark rim
+        _arrows(axes, plane, feet, factor * way[inside], (colour, 0.5 * width if small else width), "layer-motion")
 
 
 def points_svg(data: ReportData, plane: Plane, state: MeasuredState, *, name: str) -> str:
@@ -206,25 +209,31 @@ def _size(plane: Plane) -> tuple[float, float]:
     return WIDTH_INCHES, WIDTH_INCHES * up / across
 
 
-def furnish(axes: Axes, plane: Plane) -> None:
-    """Letters of the sides, a bar of millimetres, and where the plane lies."""
-    view = plane.view
+def furnish(axes: Axes, plane: Plane, *, small: bool = False) -> None:
+    """Letters of the sides, a bar of millimetres, and where the plane lies.
+
+    small: in a figure for paper, whose title tells where it lies.
+    """
+    view, size = plane.view, 6.0 if small else 8.0
     axes.set_xlim(plane.high[view.across], plane.low[view.across])
     axes.set_ylim(plane.low[view.up], plane.high[view.up])
     axes.set_axis_off()
-    places = ((0.025, 0.5), (0.975, 0.5), (0.5, 0.97), (0.5, 0.03))
+    edge = 0.04 if small else 0.025
+    places = ((edge, 0.5), (1.0 - edge, 0.5), (0.5, 0.97 - edge + 0.025), (0.5, 0.03 + edge - 0.025))
     for letter, (x, y) in zip(view.letters, places, strict=True):
-        _write(axes, x, y, letter, ha="center", va="center", fontweight="bold")
-    where = f"{'xyz'[view.normal]} = {plane.position:.0f} mm"
-    _write(axes, 0.975, 0.03, where, ha="right", va="center", fontsize=7)
+        _write(axes, x, y, letter, ha="center", va="center", fontweight="bold", fontsize=size + 1.0)
+    if not small:
+        where = f"{'xyz'[view.normal]} = {plane.position:.0f} mm"
+        _write(axes, 0.975, 0.03, where, ha="right", va="center", fontsize=7)
     width = float(plane.high[view.across] - plane.low[view.across])
     bar = next(size for size in (50.0, 20.0, 10.0, 5.0, 1.0, 0.0) if size < 0.4 * width)
     left, bottom = plane.high[view.across] - 0.06 * width, plane.low[view.up] + 0.06 * width
     stroke = [withStroke(linewidth=3.4, foreground="#000000")]
     ends = [left, left - bar]
-    axes.plot(ends, [bottom] * 2, color="white", linewidth=2.0, solid_capstyle="butt", path_effects=stroke)
+    line = {"linewidth": 1.2 if small else 2.0, "solid_capstyle": "butt", "path_effects": stroke}
+    axes.plot(ends, [bottom] * 2, color="white", **line)
     place = (left, bottom + 0.015 * width)
-    axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=8, path_effects=OUTLINE)
+    axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=size, path_effects=OUTLINE)
 
 
 def _backed(figure: Figure, data: ReportData, volume: Volume | None, plane: Plane) -> Axes:
@@ -240,14 +249,19 @@ def show_shades(axes: Axes, plane: Plane, shades: NDArray[np.float64]) -> None:
     axes.imshow(shades, extent=(across[0], across[-1], up[0], up[-1]), origin="lower", interpolation="none")
 
 
-def shades_of(data: ReportData, volume: Volume | None, plane: Plane) -> NDArray[np.float64]:
-    """Colours (n_up, n_across, 3), 0 to 1, of a volume on a plane: greys in its window, dark tissues, or black."""
+def shades_of(
+    data: ReportData, volume: Volume | None, plane: Plane, *, points: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Colours (n_up, n_across, 3), 0 to 1, of a volume on a plane: greys in its window, dark tissues, or black.
+
+    points (n_up, n_across, 3) RAS mm: what the pixels show, in the place of the plane's points.
+    """
     if volume is None:
         return np.zeros((*plane.points.shape[:2], 3))
     if volume.kind == "grey":
-        return np.repeat(_brightness(data, volume, plane)[..., None], 3, axis=2)
+        return np.repeat(_brightness(data, volume, plane, points)[..., None], 3, axis=2)
     colours = [(0.0, 0.0, 0.0), *(0.06 + 0.3 * np.array(to_rgb(tissue.colour)) for tissue in data.tissues)]
-    steps = np.nan_to_num(cut_image(volume.values, volume.grid, plane, order=0))
+    steps = np.nan_to_num(cut_image(volume.values, volume.grid, plane, order=0, points=points))
     return np.asarray(np.array(colours)[np.rint(steps).astype(int)])
 
 
@@ -286,10 +300,15 @@ def _arrows(
         axes.quiver(*places, color=style[0], width=style[1], zorder=3.0, **options).set_gid(gid)
 
 
-def _brightness(data: ReportData, volume: Volume, plane: Plane) -> NDArray[np.float64]:
-    """Brightness (n_up, n_across), 0 to 1: of a volume's greys in its window, or of its tissues by their role."""
+def _brightness(
+    data: ReportData, volume: Volume, plane: Plane, points: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Brightness (n_up, n_across), 0 to 1: of a volume's greys in its window, or of its tissues by their role.
+
+    points (n_up, n_across, 3) RAS mm: as in `shades_of`.
+    """
     if volume.kind == "grey":
-        return volume.shade(np.nan_to_num(cut_image(volume.values, volume.grid, plane)))
+        return volume.shade(np.nan_to_num(cut_image(volume.values, volume.grid, plane, points=points)))
     levels = np.array([0.0, *(ROLE_LEVELS[tissue.role] for tissue in data.tissues)])
     steps = np.nan_to_num(cut_image(volume.values, volume.grid, plane, order=0))
     return np.asarray(levels[np.rint(steps).astype(int)])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 COLOURS = "viridis"  # matplotlib's map: its brightness rises evenly, and it does not rest on red and green
 ROOM = 0.12  # of the logarithmic range, left free at both ends
 LEAST_ROOM = 1.15  # the factor that is left free at both ends at least
-RATIO_ONLY = "ratio only"  # the verdict on a modulus whose scale is not known
+LETTERS = 24  # of a tissue's name beside the colours
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class StiffnessScale:
         """What stands beside the colours."""
         if self.unit == "kPa":
             return "Young's modulus (kPa)"
-        return f"Young's modulus (ratio to {self.relative_to})" if self.relative_to else "Young's modulus (ratio)"
+        return f"E / E of {self.relative_to[:LETTERS]} (ratio)"
 
     def linear_table(self) -> NDArray[np.float64]:
         """256 colours (256, 3), 0 to 1, at equal steps of the modulus from `low` to `high`.
@@ -48,20 +48,13 @@ class StiffnessScale:
         return np.asarray(mpl.colormaps[COLOURS](place)[:, :3])
 
 
-def stiffness_scale(
-    moduli: Sequence[float | None], names: Sequence[str], *, unit: str, relative_to: str, verdicts: Sequence[str]
-) -> StiffnessScale:
-    """The scale of the moduli of tissues with these `names`, in `unit`, of which some may be None or NaN.
+def stiffness_scale(moduli: Sequence[float | None], *, unit: str, relative_to: str, factor: float) -> StiffnessScale:
+    """The scale of the moduli of tissues, of which some may be None or NaN, shown in `unit` after a `factor`.
 
-    Where a verdict is `ratio only`, the kilopascals rest on a modulus that is not known: ratios to `relative_to` are
-    shown. Raises `ValueError` where no tissue has a modulus.
+    Raises `ValueError` where no tissue has a modulus.
     """
-    found = {name: value for name, value in zip(names, moduli, strict=True) if value and value > 0.0}
-    if not found:
+    values = tuple(sorted({factor * value for value in moduli if value and value > 0.0}))
+    if not values:
         raise ValueError("no tissue has a modulus")
-    factor = 1.0
-    if unit == "kPa" and RATIO_ONLY in verdicts and relative_to in found:
-        unit, factor = "ratio", 1.0 / found[relative_to]
-    values = tuple(sorted({factor * value for value in found.values()}))
     room = max((values[-1] / values[0]) ** ROOM, LEAST_ROOM)
     return StiffnessScale(unit, relative_to, factor, values[0] / room, values[-1] * room, values)
