@@ -15,7 +15,7 @@ from palpate.report.report_data import ModelSurface, ReportData
 from palpate.report.rows import number as text_of
 from palpate.report.scales import distance_scale
 
-HEIGHT_MM, BAR_MM, WORDS_MM, TITLE_MM = 58.0, 14.0, 3.6, 6.0
+HEIGHT_MM, BAR_MM, WORDS_MM, TITLE_MM = 58.0, 15.0, 3.6, 6.0
 PIXELS = (1000, 690)  # of each picture
 
 

@@ -34,7 +34,7 @@ from palpate.report.slices import (
     stiffness_on,
 )
 
-GAP_MM, EDGE_MM, TITLE_MM, LEGEND_MM, BAR_MM = 2.0, 1.0, 6.0, 6.0, 14.0
+GAP_MM, EDGE_MM, TITLE_MM, LEGEND_MM, BAR_MM = 2.0, 1.0, 6.0, 6.0, 15.0
 DARK = (withStroke(linewidth=4.0, foreground="#333333"),)  # under a white line on a white sheet
 DOTTED = (0, (1, 1.6))
 RADIOLOGICAL = "The patient's right is on the left of axial and coronal slices."
@@ -89,7 +89,7 @@ def _paint(
     furnish(axes, plane, small=True)
 
 
-def colour_bar(figure: Figure, scale: Scale, *, left_mm: float = 40.0, bottom_mm: float = 8.5) -> None:
+def colour_bar(figure: Figure, scale: Scale, *, left_mm: float = 40.0, bottom_mm: float = 9.5) -> None:
     """A horizontal bar of a scale's colours with its ticks and its label, 3 mm high."""
     wide, tall = (25.4 * size for size in figure.get_size_inches())
     axes = figure.add_axes((left_mm / wide, bottom_mm / tall, (wide - 2.0 * left_mm) / wide, 3.0 / tall))
