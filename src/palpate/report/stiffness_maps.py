@@ -5,6 +5,7 @@ Where the data removed less than half of what was not known, a slice is hatched 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -72,8 +73,15 @@ def map_svg(data: ReportData, of: TissueMap, *, name: str) -> str:
 
     A length of the one colour bar is the same factor as on the other.
     """
+    says = f"Slices of the modulus inside {data.tissues[of.tissue].name}, and of its standard deviation. {of.words}"
+    size = (2.0 * SIDE_INCHES + 0.6, 3.0 * SIDE_INCHES + 1.2)
+    return draw_svg(map_drawing(data, of), size=size, name=name, says=says)
+
+
+def map_drawing(data: ReportData, of: TissueMap) -> Callable[[Figure], None]:
+    """What paints the slices of a map, and of its standard deviation, on a figure."""
     shown = shown_stiffness(data)
-    scale, tissue = map_scale(of, shown), data.tissues[of.tissue].name
+    scale = map_scale(of, shown)
     spread = Scale(COLOURS, 1.0, scale.high / scale.low, True, "factor of one standard deviation", ())
 
     def draw(figure: Figure) -> None:
@@ -94,8 +102,7 @@ def map_svg(data: ReportData, of: TissueMap, *, name: str) -> str:
             drawn.ax.xaxis.set_major_formatter(StrMethodFormatter("{x:.3g}"))
             drawn.ax.xaxis.set_minor_formatter(NullFormatter())
 
-    says = f"Slices of the modulus inside {tissue}, and of its standard deviation. {of.words}"
-    return draw_svg(draw, size=(2.0 * SIDE_INCHES + 0.6, 3.0 * SIDE_INCHES + 1.2), name=name, says=says)
+    return draw
 
 
 def _slice(axes: Axes, plane: Plane, cut: MapSlice, values: NDArray[np.float32], scale: Scale) -> None:

@@ -9,10 +9,12 @@ Palpate.cutMesh = (nodes, tets, view, position, box) => {
   const width = Math.ceil((high[across] - low[across]) / FIELD_PIXEL), height = Math.ceil((high[up] - low[up]) / FIELD_PIXEL);
   const tet = new Int32Array(width * height).fill(-1), shares = new Float32Array(4 * width * height);
   const b = [[], [], [], []]; // value at column 0 and row 0, then its change with each column and row
+  const above = Int8Array.from({ length: nodes.length / 3 }, (_, i) => (nodes[3 * i + normal] > position ? 1 : 0));
   for (let t = 0; t < tets.length / 4; t++) {
+    const sum = above[tets[4 * t]] + above[tets[4 * t + 1]] + above[tets[4 * t + 2]] + above[tets[4 * t + 3]];
+    if (sum === 0 || sum === 4) continue; // most tetrahedra are not cut
     const p = [0, 1, 2, 3].map((k) => 3 * tets[4 * t + k]);
     const heights = p.map((at) => nodes[at + normal] - position);
-    if (Math.min(...heights) > 0 || Math.max(...heights) < 0) continue;
     const e = [1, 2, 3].map((k) => [across, up, normal].map((axis) => nodes[p[k] + axis] - nodes[p[0] + axis]));
     const cross = (u, v) => [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
     const faces = [cross(e[1], e[2]), cross(e[2], e[0]), cross(e[0], e[1])];

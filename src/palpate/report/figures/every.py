@@ -12,6 +12,7 @@ import numpy as np
 
 from palpate.errors import EstimationError, InputDataError
 from palpate.progress import Progress, silent
+from palpate.report.figures.maps import map_sheet
 from palpate.report.figures.moduli import chosen_unit, moduli_sheet
 from palpate.report.figures.motion import motion_caption, motion_gif
 from palpate.report.figures.residuals import residual_sheet
@@ -102,6 +103,8 @@ def _drawings(data: ReportData, units: Sequence[ModulusUnit]) -> Iterator[tuple[
         yield f"moduli-{unit.name.lower()}", partial(_of_sheet, partial(moduli_sheet, data.document, colours, unit))
     if data.references:
         yield "stiffness-slices", partial(_of_sheet, partial(stiffness_sheet, data))
+    for number in range(len(data.maps)):
+        yield f"map-{number + 1}", partial(_of_sheet, partial(map_sheet, data, number))
     for number, later in enumerate(data.later):
         yield f"before-after-{number + 1}", partial(_of_sheet, partial(before_after_sheet, data, number))
         if later.model:
