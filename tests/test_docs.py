@@ -143,3 +143,9 @@ def test_every_dependency_is_used():
 def test_every_dependency_has_its_line():
     told = (ROOT / "docs" / "libraries.md").read_text().lower()
     assert [name for name in requirements() if not re.search(rf"\b{name.lower()}\b", told)] == []
+
+
+def test_the_gallery_has_six_small_pictures():
+    named = re.findall(r"\]\((pictures/gallery-[^)]+)\)", (ROOT / "docs" / "gallery.md").read_text())
+    assert len(named) == 6
+    assert all((ROOT / "docs" / name).stat().st_size < 150_000 for name in named)
