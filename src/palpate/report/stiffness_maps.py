@@ -29,7 +29,7 @@ from palpate.study.stiffness_scale import StiffnessScale
 
 ROOM_MM = 3.0  # round the tissue
 COLOURS = "cividis"  # which is read alike by who sees no red or green
-FACTORS = (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0)
+FACTORS, DECADE, CLOSE = (1.0, 1.2, 1.5, 2.0, 3.0, 5.0), (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0), 5.0
 SIDE_INCHES = 1.9
 
 
@@ -95,7 +95,8 @@ def map_drawing(data: ReportData, of: TissueMap) -> Callable[[Figure], None]:
         for column, of_column in enumerate((scale, spread)):
             bar = figure.add_axes(((0.06 + 0.5 * column), 0.075, 0.38, 0.02))
             mapped = ScalarMappable(LogNorm(of_column.low, of_column.high), of_column.name)
-            places = [place for place, _ in of_column.ticks] or [f for f in FACTORS if f <= of_column.high]
+            factors = FACTORS if of_column.high < CLOSE else DECADE
+            places = [place for place, _ in of_column.ticks] or [f for f in factors if f <= of_column.high]
             drawn = figure.colorbar(mapped, cax=bar, orientation="horizontal", label=of_column.label)
             drawn.ax.xaxis.set_major_locator(FixedLocator(places))
             drawn.ax.xaxis.set_minor_locator(NullLocator())
