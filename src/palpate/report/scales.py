@@ -93,10 +93,9 @@ def displacement_scale(later: LaterImage) -> Scale:
     """Length of the fitted motion to a later image, from 0 to a round number of mm that nothing exceeds by much."""
     lengths = np.linalg.norm(later.motion.astype(np.float64), axis=1)
     top = float(np.percentile(lengths, 99.9)) if len(lengths) else 0.0
-    ticks = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, max(top, 1e-3))
-    return Scale(
-        "plasma", 0.0, float(ticks[-1]), False, "fitted motion (mm)", tuple((t, f"{t:g}") for t in ticks.tolist())
-    )
+    places = [float(t) for t in MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, max(top, 1e-3))]
+    ticks = tuple((place, f"{place:g}") for place in places)
+    return Scale("plasma", 0.0, places[-1], False, "fitted motion (mm)", ticks)
 
 
 def angle_scale() -> Scale:

@@ -230,8 +230,8 @@ def furnish(axes: Axes, plane: Plane, *, small: bool = False) -> None:
     left, bottom = plane.high[view.across] - 0.06 * width, plane.low[view.up] + 0.06 * width
     stroke = [withStroke(linewidth=3.4, foreground="#000000")]
     ends = [left, left - bar]
-    line = {"linewidth": 1.2 if small else 2.0, "solid_capstyle": "butt", "path_effects": stroke}
-    axes.plot(ends, [bottom] * 2, color="white", **line)
+    wide = 1.2 if small else 2.0
+    axes.plot(ends, [bottom] * 2, color="white", linewidth=wide, solid_capstyle="butt", path_effects=stroke)
     place = (left, bottom + 0.015 * width)
     axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=size, path_effects=OUTLINE)
 

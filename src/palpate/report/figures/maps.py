@@ -14,8 +14,8 @@ def map_sheet(data: ReportData, number: int) -> Sheet:
     """The map of that number."""
     of = data.maps[number]
     caption = (
-        f"Map of stiffness inside {data.tissues[of.tissue].name}, in three slices. Left: the modulus"
-        f" ({shown_stiffness(data).label}). Right: the factor by which it may be off (one standard deviation of its"
+        f"Map of stiffness inside {data.tissues[of.tissue].name}, in three slices. Left:"
+        f" {shown_stiffness(data).label}. Right: the factor by which it may be off (one standard deviation of its"
         " logarithm). Both bars are logarithmic. Hatched: the data removed less than half of what was not known; there"
         f" the mean of the tissue is shown. {of.words}"
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
+from numpy.typing import NDArray
 
 from palpate.report.figures.sheet import PAGE_MM, Sheet
 from palpate.report.report_data import ReportData, Volume
@@ -81,11 +82,9 @@ def strip_of(data: ReportData, reference: int = 0) -> Strip:
     return Strip(first_planes(box))
 
 
-def _paint(
-    data: ReportData, axes: Axes, plane: Plane, volume: Volume | None, colours: Callable[[np.ndarray], np.ndarray]
-) -> None:
-    """The image on the plane, as `colours` changes its shades; letters, and a bar of millimetres."""
-    show_shades(axes, plane, colours(shades_of(data, volume, plane)))
+def _paint(axes: Axes, plane: Plane, shades: NDArray[np.float64]) -> None:
+    """Shades (n_up, n_across, 3) on the plane, letters, and a bar of millimetres."""
+    show_shades(axes, plane, shades)
     furnish(axes, plane, small=True)
 
 
@@ -118,7 +117,7 @@ def stiffness_sheet(data: ReportData) -> Sheet:
     def draw(figure: Figure) -> None:
         """Slices, contours, legend and colour bar."""
         for axes, plane, of in zip(strip.axes(figure, bottom_mm=BAR_MM + LEGEND_MM), strip.planes, values, strict=True):
-            _paint(data, axes, plane, reference.background, lambda shades, of=of: coloured(shades, of, scale))
+            _paint(axes, plane, coloured(shades_of(data, reference.background, plane), of, scale))
             for surface in reference.surfaces:
                 draw_lines(axes, data, plane, surface, gid="before", linewidth=0.8)
         legend(figure, data, bottom_mm=BAR_MM + 1.0)
@@ -126,8 +125,8 @@ def stiffness_sheet(data: ReportData) -> Sheet:
 
     caption = (
         f"Estimated Young's modulus over {reference.name}, in axial, coronal and sagittal slices. Only organs whose"
-        " modulus was estimated are coloured; lines are the contours of the segmentation. The colours are logarithmic"
-        f" and have marks at the moduli of all tissues of the model ({scale.label}). {RADIOLOGICAL}"
+        " modulus was estimated are coloured; lines are the contours of the segmentation. The colours show"
+        f" {scale.label} on a logarithmic scale, with marks at the moduli of all tissues of the model. {RADIOLOGICAL}"
     )
     height = TITLE_MM + max(strip.heights_mm) + LEGEND_MM + BAR_MM
     return Sheet("stiffness-slices", caption, PAGE_MM, height, draw)
@@ -145,13 +144,8 @@ def displacement_sheet(data: ReportData, number: int) -> Sheet:
         places = strip.axes(figure, bottom_mm=BAR_MM + LEGEND_MM)
         for axes, plane, motion in zip(places, strip.planes, motions, strict=True):
             lengths = np.linalg.norm(motion, axis=2)
-            _paint(
-                data,
-                axes,
-                plane,
-                reference.background,
-                lambda shades, of=lengths: coloured(shades, of, scale, full=FADED),
-            )
+            shades = shades_of(data, reference.background, plane)
+            _paint(axes, plane, coloured(shades, lengths, scale, full=FADED))
             for surface in reference.surfaces:
                 draw_lines(axes, data, plane, surface, gid="before", linewidth=0.8)
             motion_arrows(axes, plane, motion, factor, small=True)
@@ -190,7 +184,7 @@ def before_after_sheet(data: ReportData, number: int) -> Sheet:
         for row, (_, volume) in enumerate(rows):
             bottom = 2.0 * LEGEND_MM + (len(rows) - 1 - row) * tall
             for axes, plane in zip(strip.axes(figure, bottom_mm=bottom), strip.planes, strict=True):
-                _paint(data, axes, plane, volume, lambda shades: shades)
+                _paint(axes, plane, shades_of(data, volume, plane))
                 for surface in later.surfaces:
                     draw_lines(axes, data, plane, surface, gid="after", linewidth=3.0, alpha=0.5)
                 for surface in reference.surfaces:
