@@ -14,6 +14,7 @@ from palpate.report.cut_mesh import element_moduli
 from palpate.report.figures.maps import map_sheet
 from palpate.report.page import render
 from palpate.report.report_data import ReportData
+from palpate.report.scales import modulus_scale
 from palpate.report.stiffness_maps import map_png, map_svg, tissue_maps
 from palpate.uncertainty import DifferentRegion, StiffnessMap
 
@@ -78,6 +79,9 @@ def test_figures_show_the_map_in_the_unit_of_the_report(mapped):
     data = collect(mapped)
     moduli = element_moduli(data)[data.maps[0].elements]
     np.testing.assert_allclose(moduli, data.maps[0].moduli, rtol=1e-6)
+    scale = modulus_scale(data)
+    assert scale.low < moduli.min()
+    assert moduli.max() < scale.high  # colours tell the ends of the map apart
     first, *others = data.document["estimates"]
     document = dict(data.document) | {"estimates": [first | {"verdict": "ratio only"}, *others]}
     lost = dataclasses.replace(data, document=document)

@@ -80,7 +80,9 @@ def modulus_scale(data: ReportData) -> Scale:
 def shown_stiffness(data: ReportData) -> StiffnessScale:
     """In which unit and between which limits moduli are shown; raises `ValueError` where no tissue has one."""
     unit, moduli = shown_unit(data.document), [tissue.modulus for tissue in data.tissues]
-    return stiffness_scale(moduli, unit=unit.name, relative_to=unit.relative_to, factor=unit.of_document(1.0))
+    mapped = np.concatenate([np.zeros(0, np.float32), *(of.moduli for of in data.maps)])
+    to, factor = unit.relative_to, unit.of_document(1.0)
+    return stiffness_scale(moduli, unit=unit.name, relative_to=to, factor=factor, mapped=mapped)
 
 
 def shown_moduli(data: ReportData) -> NDArray[np.float64]:

@@ -48,13 +48,25 @@ class StiffnessScale:
         return np.asarray(mpl.colormaps[COLOURS](place)[:, :3])
 
 
-def stiffness_scale(moduli: Sequence[float | None], *, unit: str, relative_to: str, factor: float) -> StiffnessScale:
+def stiffness_scale(
+    moduli: Sequence[float | None],
+    *,
+    unit: str,
+    relative_to: str,
+    factor: float,
+    mapped: NDArray[np.floating] | None = None,
+) -> StiffnessScale:
     """The scale of the moduli of tissues, of which some may be None or NaN, shown in `unit` after a `factor`.
 
+    mapped (n,): moduli of the elements of tissues with a map, in the result's unit; the limits hold 99 % of them.
     Raises `ValueError` where no tissue has a modulus.
     """
     values = tuple(sorted({factor * value for value in moduli if value and value > 0.0}))
     if not values:
         raise ValueError("no tissue has a modulus")
-    room = max((values[-1] / values[0]) ** ROOM, LEAST_ROOM)
-    return StiffnessScale(unit, relative_to, factor, values[0] / room, values[-1] * room, values)
+    ends = [values[0], values[-1]]
+    if mapped is not None and len(mapped):
+        ends += [factor * float(end) for end in np.quantile(mapped, [0.005, 0.995])]
+    low, high = min(ends), max(ends)
+    room = max((high / low) ** ROOM, LEAST_ROOM)
+    return StiffnessScale(unit, relative_to, factor, low / room, high * room, values)
