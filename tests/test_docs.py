@@ -212,3 +212,9 @@ def test_every_object_of_the_reference_of_python_can_be_found():
     for name in re.findall(r"^::: ([\w.]+)$", page, flags=re.MULTILINE):
         module, _, item = name.rpartition(".")
         assert hasattr(resolve_name(module), item), name
+
+
+def test_the_gallery_has_six_small_pictures():
+    named = re.findall(r"\]\((pictures/gallery-[^)]+)\)", (ROOT / "docs" / "gallery.md").read_text())
+    assert len(named) == 6
+    assert all((ROOT / "docs" / name).stat().st_size < 150_000 for name in named)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from palpate.steps.commands import sensitivity as sensitivity
     from palpate.steps.commands import simulate as simulate
     from palpate.steps.commands import voxelise as voxelise
+    from palpate.steps.figures import figures as figures
     from palpate.steps.results import CaseResult as CaseResult
     from palpate.steps.results import SavedResult as SavedResult
     from palpate.study.case import Case as Case

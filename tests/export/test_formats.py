@@ -36,6 +36,8 @@ from palpate.mechanics.laws.registry import LAWS
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.surface import triangle_normals
 from palpate.mesh.tet_mesh import FACES
+from palpate.report.collect import collect
+from palpate.report.scales import modulus_scale
 from palpate.study.case import CaseLoad
 from palpate.study.case_loads import loads_on
 
@@ -508,6 +510,24 @@ def test_the_scripts_of_viewers_load_files_that_are_there(exported, put_library,
     assert len(loaded) >= (12 if name == "slicer" else 1)
     assert all((folder / path).is_file() for path in loaded)
     assert json.loads((folder / "scene.json").read_text())["schema"] == f"palpate.{name}/1"
+
+
+@pytest.mark.parametrize("verdict", ["identified", "ratio only"])
+def test_slicer_shares_unit_limits_and_colours_with_the_report(case_result, tmp_path, verdict):
+    estimation = case_result.estimation
+    items = tuple(dataclasses.replace(item, verdict=verdict) for item in estimation.estimates)
+    result = dataclasses.replace(case_result, estimation=dataclasses.replace(estimation, estimates=items))
+    palpate.export(result, tmp_path, format="slicer")
+    scene = json.loads((tmp_path / "scene.json").read_text())["stiffness"]
+    scale = modulus_scale(collect(result))
+    assert scene["name"] == scale.label
+    assert ("kPa" in scene["name"]) == (verdict == "identified")
+    assert scene["range"] == pytest.approx([scale.low, scale.high])
+    values = np.unique(np.asarray(nibabel.load(tmp_path / "stiffness.nii.gz").dataobj))
+    shown = np.array([value for value, _ in scale.ticks])
+    np.testing.assert_allclose(values[values > 0], shown, rtol=1e-5)
+    places = np.rint(255 * (shown - scale.low) / (scale.high - scale.low)).astype(int)
+    np.testing.assert_allclose(np.array(scene["colours"])[places], scale.colours(shown), atol=0.02)
 
 
 def with_mechanics(result, law, loads=()):

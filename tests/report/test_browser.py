@@ -7,6 +7,7 @@ import dataclasses
 import io
 import shutil
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import matplotlib.image as mpimg
 import numpy as np
@@ -16,7 +17,9 @@ from bodies import ELSEWHERE, STILL, body
 from palpate.images.readers import write_scalar_image
 from palpate.observation.contract import PointMotions
 from palpate.report.case_report import write_case_report
+from palpate.report.collect import collect
 from palpate.report.preview import preview_page
+from palpate.report.scales import modulus_scale
 from palpate.study.case import Case, CaseTissue, Images
 from palpate.study.check import Checked, CheckReport
 from palpate.study.estimated import PointFit
@@ -199,20 +202,92 @@ def test_every_slider_says_what_it_stands_at(opened):
     assert all(words)
 
 
+def test_slices_show_stiffness_or_displacement_with_its_own_bar(opened):
+    page = opened()
+    figure = alive(page, "slices")
+    canvas, bars = figure.locator(".live canvas").nth(2), figure.locator(".live .colour-bar:visible .bar-label")
+    assert bars.all_inner_texts() == ["Young's modulus (kPa)"]
+    stiffness = drawn(canvas)
+    figure.locator(".colours label", has_text="displacement").click()
+    assert bars.all_inner_texts() == ["fitted motion (mm)"]
+    motion = drawn(canvas)
+    figure.locator(".colours label", has_text="contours alone").click()
+    assert not bars.all_inner_texts()
+    bare = drawn(canvas)
+    assert min(changed(stiffness, motion), changed(motion, bare), changed(stiffness, bare)) > 0.05
+    figure.locator(".colours label", has_text="displacement").click()
+    figure.locator(".states label", has_text="after.nii.gz").click()
+    assert changed(motion, drawn(canvas)) > 0.005  # the model lies where the motion has brought it
+
+
+def test_the_colours_of_a_slice_are_those_of_its_bar(opened, case_result):
+    """Over the label image of an organ lies, by 0.6, the colour that the shared scale gives its modulus."""
+    page = opened()
+    figure = alive(page, "slices")
+    for layer in ("before", "after", "model"):
+        figure.locator(f".t-{layer}").set_checked(False)
+    coloured = drawn(figure.locator(".live canvas").nth(2))
+    figure.locator(".colours label", has_text="contours alone").click()
+    bare = drawn(figure.locator(".live canvas").nth(2))
+    (colours,) = {
+        tuple(np.rint(colour * 50)) for colour in (modulus_scale(collect(case_result)).colours(np.array([58.9])))
+    }
+    found = np.rint(50 * (coloured - 0.4 * bare) / 0.6).reshape(-1, 3)
+    assert (np.abs(found - np.array(colours)).max(axis=1) <= 2).mean() > 0.03
+
+
+@pytest.mark.parametrize(
+    ("place", "ending"),
+    [
+        ("section.slices .live figure", ".png"),
+        ("section.organs .stage", ".png"),
+        ("#result .charts figure, #residuals .charts figure", ".svg"),
+    ],
+)
+def test_a_figure_saves_itself_by_the_keyboard(opened, tmp_path, place, ending):
+    page = opened()
+    for section in ("slices", "organs"):
+        alive(page, section)
+    figure = page.locator(place).first
+    button = figure.locator(".save")
+    assert button.get_attribute("aria-label").startswith(f"Save {ending[1:].upper()}: ")
+    button.focus()
+    with page.expect_download() as download:
+        page.keyboard.press("Enter")
+    assert download.value.suggested_filename.endswith(ending)
+    assert download.value.suggested_filename.startswith("sub-01-")
+    path = tmp_path / f"figure{ending}"
+    download.value.save_as(path)
+    if ending == ".png":
+        assert float(np.ptp(mpimg.imread(path)[..., :3])) > 0.5
+    else:
+        assert ET.parse(path).getroot().tag == "{http://www.w3.org/2000/svg}svg"
+
+
+def test_every_figure_with_a_picture_has_one_button(opened):
+    page = opened()
+    counts = page.evaluate(
+        "[...document.querySelectorAll('main figure, main .stage')].map((f) => [f.querySelectorAll('.save').length,"
+        " Boolean(f.querySelector('svg, canvas, img'))])"
+    )
+    assert len(counts) > 12
+    assert all(number == int(has) for number, has in counts)
+
+
 def test_layers_and_states_can_be_told_apart(opened):
     page = opened()
     figure = alive(page, "slices")
     canvas = figure.locator("canvas").nth(2)
-    both = pixels(canvas)
+    both = drawn(canvas)
     figure.locator(".modes label", has_text="after.nii.gz").click()
-    after = pixels(canvas)
+    after = drawn(canvas)
     figure.locator(".modes label", has_text="before.nii.gz").click()
-    before = pixels(canvas)
+    before = drawn(canvas)
     assert changed(after, before) > 0.005
     assert changed(both, before) > 0.005
     figure.locator(".modes label", has_text="after.nii.gz").click()
     figure.locator(".t-model").uncheck()
-    assert changed(after, pixels(canvas)) > 0.002
+    assert changed(after, drawn(canvas)) > 0.002
 
 
 def test_arrows_of_measured_points_are_drawn_asked_for_and_found(browser, case_result, tmp_path):
@@ -259,6 +334,9 @@ def test_the_slices_of_a_second_pair_lie_in_its_own_body(browser, two_pairs, tmp
     axial = [float(page.locator("section.slices input[type=range]").nth(3 * k).input_value()) for k in (0, 1)]
     assert axial[1] - axial[0] == pytest.approx(50.0, abs=1.0)
     first = page.locator("section.slices").first
+    first.locator(
+        ".colours label", has_text="contours alone"
+    ).click()  # the mesh that is kept is that of the first pair
     coronal = [drawn(section.locator("canvas").nth(1)) for section in (first, found)]
     assert changed(*coronal) < 0.03  # the same body: nothing but the millimetres in the corner may differ
     assert changed(coronal[1], np.zeros_like(coronal[1])) > 0.2

@@ -104,7 +104,7 @@ def test_the_policy_allows_the_pages_own_scripts_and_no_other(page):
     scripts = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
     policy = next(a["content"] for _, a in tags(page) if a.get("http-equiv") == "Content-Security-Policy")
     digests = {base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts}
-    assert len(scripts) == 8
+    assert len(scripts) == 10
     assert digests == set(re.findall(r"'sha256-([^']+)'", policy))
     assert "unsafe-inline" not in policy.split("script-src")[1].split(";")[0]
 
@@ -193,7 +193,7 @@ def test_a_name_can_neither_inject_markup_nor_stop_the_drawing(case_result, tmp_
     page = write_case_report(with_name(case_result, EVIL), tmp_path).read_text(encoding="utf-8")
     found = tags(page)
     assert not [tag for tag, attributes in found if "onerror" in attributes or attributes.get("src") == "x"]
-    assert len([tag for tag, _ in found if tag == "script"]) == 10  # the page's eight, and two of data
+    assert len([tag for tag, _ in found if tag == "script"]) == 12  # the page's ten, and two of data
     assert "could not be" not in page[: page.index("<script")]
     assert "&lt;/script&gt;" in page
     facts = re.search(r'id="facts">(.*?)</script>', page, flags=re.DOTALL).group(1)

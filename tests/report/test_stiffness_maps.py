@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 
 from palpate.report.collect import collect
+from palpate.report.cut_mesh import element_moduli
+from palpate.report.figures.maps import map_sheet
 from palpate.report.page import render
 from palpate.report.report_data import ReportData
+from palpate.report.scales import modulus_scale
 from palpate.report.stiffness_maps import map_png, map_svg, tissue_maps
 from palpate.uncertainty import DifferentRegion, StiffnessMap
 
@@ -69,3 +72,21 @@ def test_a_map_that_the_data_resolve_has_no_hatching(mapped):
     result = dataclasses.replace(mapped, estimation=dataclasses.replace(mapped.estimation, maps=(clear,)))
     data = collect(result)
     assert "<pattern" not in map_svg(data, data.maps[0], name="m")
+
+
+def test_figures_show_the_map_in_the_unit_of_the_report(mapped):
+    """On the slices each element has its own modulus; of what is known as a ratio alone all are ratios."""
+    data = collect(mapped)
+    moduli = element_moduli(data)[data.maps[0].elements]
+    np.testing.assert_allclose(moduli, data.maps[0].moduli, rtol=1e-6)
+    scale = modulus_scale(data)
+    assert scale.low < moduli.min()
+    assert moduli.max() < scale.high  # colours tell the ends of the map apart
+    first, *others = data.document["estimates"]
+    document = dict(data.document) | {"estimates": [first | {"verdict": "ratio only"}, *others]}
+    lost = dataclasses.replace(data, document=document)
+    np.testing.assert_allclose(element_moduli(lost)[data.maps[0].elements], 0.1 * moduli, rtol=1e-6)
+    for each, label in ((data, "Young's modulus (kPa)"), (lost, "E / E of surroundings (ratio)")):
+        sheet = map_sheet(each, 0)
+        assert label in sheet.caption
+        assert f">{label}</text>" in sheet.files(("svg",), dpi=60)["map-1.svg"].decode()

@@ -6,8 +6,9 @@ import dataclasses
 from dataclasses import fields
 
 import pytest
+from matplotlib.figure import Figure
 
-from palpate.errors import ResourceError
+from palpate.errors import ConfigurationError, ResourceError
 from palpate.steps.results import CaseResult
 
 NUMBERS = ["value_kpa", "low_kpa", "high_kpa", "ratio", "ratio_low", "ratio_high"]
@@ -107,3 +108,29 @@ def test_a_figure_of_ratios_or_of_nothing_can_be_drawn(result, changes):
     estimation = {key: value for key, value in changes.items() if key == "status"}
     items = [{} if estimation else changes] * 2
     with_estimates(result, *items, **estimation).plot().draw_without_rendering()
+
+
+def test_a_figure_shows_itself_in_a_notebook_and_can_be_saved(result, tmp_path):
+    figure = result.plot()
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    figure.savefig(tmp_path / "moduli.svg")
+    assert (tmp_path / "moduli.svg").stat().st_size > 1000
+
+
+def test_a_plot_goes_on_given_axes(result):
+    figure = Figure()
+    left, right = figure.subplots(1, 2)
+    assert result.plot(right, unit="ratio") is right
+    assert not left.lines
+    assert right.get_xlabel().startswith("E / E of surroundings (ratio)")
+    assert [line.get_xdata()[0] for line in right.lines if line.get_gid() == "interval"] == pytest.approx(
+        [4.712, 2.496]
+    )
+
+
+def test_moduli_known_as_ratios_alone_are_plotted_as_ratios(result):
+    lost = with_estimates(result, {"verdict": "ratio only"})
+    (axes,) = lost.plot().axes
+    assert "kPa" not in axes.get_xlabel()
+    with pytest.raises(ConfigurationError, match="ask for the unit 'ratio'"):
+        lost.plot(unit="kPa")

@@ -1,4 +1,4 @@
-"""The sub-commands around an estimate: init, check, noise, voxelise, mesh, simulate, export, view."""
+"""The sub-commands around an estimate: init, check, noise, voxelise, mesh, simulate, export, figures, view."""
 
 from __future__ import annotations
 
@@ -150,6 +150,27 @@ def export(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progre
     export_into(outputs, model, arguments.format, Options(arguments.linear, arguments.source))
     document = {"schema": "palpate.export/1", "format": arguments.format, "files": list(outputs.written)}
     return Outcome(document, listed(outputs))
+
+
+def figures(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress: Progress) -> Outcome:
+    """Write the figures of an estimate for a paper or a talk."""
+    from palpate.steps.figures import figures_into, read_data, refuse_settings
+
+    formats = tuple(dict.fromkeys(arguments.formats.split(",")))
+    refuse_settings(formats, arguments.dpi)
+    if outputs.same_files([""], [arguments.result]):
+        raise ConfigurationError(f"{outputs.path} is the folder of the result itself: choose another --output")
+    progress("reading the result")
+    data = read_data(arguments.result)
+    drawn = figures_into(outputs, data, formats=formats, unit=arguments.unit, dpi=arguments.dpi, progress=progress)
+    document = {
+        "schema": "palpate.figures/1",
+        "figures": [{"name": of.name, "caption": of.caption, "files": list(of.files)} for of in drawn if of.files],
+        "missing": [{"name": of.name, "reason": of.missing} for of in drawn if not of.files],
+        "files": list(outputs.written),
+    }
+    missing = "".join(f"not drawn: {of.name}: {of.missing}\n" for of in drawn if not of.files)
+    return Outcome(document, f"{missing}{listed(outputs)}")
 
 
 def view(arguments: argparse.Namespace, _: None, outputs: None, progress: Progress) -> Outcome:

@@ -52,6 +52,7 @@ EXAMPLES = {
         "palpate export out --format abaqus --output abaqus",
         "palpate export out --format dicom --source series/ --output dicom",
     ),
+    "figures": ("palpate figures out --output figures", "palpate figures out --formats pdf --unit ratio --dpi 600"),
     "report": ("palpate report out", "palpate report out --json"),
     "sensitivity": (
         "palpate sensitivity case/case.toml --output out",
@@ -180,7 +181,7 @@ def _add_preparations(subparsers: Any) -> None:
 
 
 def _add_estimates(subparsers: Any) -> None:
-    """What finds moduli and hands them on: estimate, sensitivity, report, export, view."""
+    """What finds moduli and hands them on: estimate, sensitivity, report, export, figures, view."""
     what = "find the Young's modulus of each organ of a case, or of label images before and after"
     estimate = _command(subparsers, "estimate", written.estimate, what=what)
     estimate.add_argument(
@@ -217,6 +218,16 @@ def _add_estimates(subparsers: Any) -> None:
     export.add_argument("--linear", action="store_true", help="tetrahedra with four nodes instead of ten")
     export.add_argument("--source", type=Path, metavar="SERIES", help="dicom: the first image's DICOM series")
     export.set_defaults(logs=False)  # which would hold the command with its paths
+    what = "write the figures of an estimate for a paper or a talk, with captions"
+    figures = _command(subparsers, "figures", commands.figures, what=what, folder="palpate-figures")
+    figures.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
+    what = "file formats, separated by commas; the animation is always a GIF; default: %(default)s"
+    figures.add_argument("--formats", default="svg,pdf,png", metavar="LIST", help=what)
+    what = "unit of the moduli; default: both, where both are known"
+    figures.add_argument("--unit", choices=("ratio", "kPa"), help=what)
+    what = "dots an inch of PNG, and of pictures inside SVG and PDF; default: %(default)s"
+    figures.add_argument("--dpi", type=_dots, default=300, metavar="N", help=what)
+    figures.set_defaults(logs=False)
     what = "show the report of an estimate and its files in a browser, on this machine only"
     view = _command(subparsers, "view", commands.view, what=what, folder=None)
     view.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
@@ -326,6 +337,12 @@ def _samples(text: str) -> str:
 def _count(text: str) -> int:
     if not re.fullmatch(r"[0-9]{1,4}", text) or not 1 <= int(text) <= 1000:
         raise argparse.ArgumentTypeError(f"{text[:20]!r} is no whole number from 1 to 1000")
+    return int(text)
+
+
+def _dots(text: str) -> int:
+    if not re.fullmatch(r"[0-9]{1,4}", text):
+        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no whole number of dots an inch")
     return int(text)
 
 

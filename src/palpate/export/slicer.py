@@ -16,22 +16,28 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import tissue_colours
 from palpate.mesh.locate import modulus_image
 from palpate.study.outputs import write_json
+from palpate.study.stiffness_scale import StiffnessScale, stiffness_scale
 
 
 def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     """Write load_in_slicer.py, labels.nii.gz and .csv, stiffness.nii.gz, the surfaces (.ply), the warp, scene.json."""
     write_labels(Segmentation(body.index, body.grid, body.tissues), folder)
-    write_scalar_image(folder / "stiffness.nii.gz", modulus_image(body.mesh, body.grid, model.moduli), body.grid)
+    scale = shown_scale(model)
+    stiffness = modulus_image(body.mesh, body.grid, scale.factor * model.moduli)
+    write_scalar_image(folder / "stiffness.nii.gz", stiffness, body.grid)
     write_ply(model, body, folder)
     warp.write(model, body, folder)
     shown = zip(body.tissues, tissue_colours(body.tissues), strict=True)
     colours = {tissue.name: [part / 255.0 for part in bytes.fromhex(colour[1:])] for tissue, colour in shown}
     roles = {tissue.name: str(tissue.role) for tissue in body.tissues}
-    known = model.moduli[np.isfinite(model.moduli)]
-    name = "Young's modulus (kPa)" if model.unit == "kPa" else f"Young's modulus (ratio to {model.relative_to})"
     scene = {
         "schema": "palpate.slicer/1",
-        "stiffness": {"name": name, "range": [0.0, float(known.max())], "least": 0.5 * float(known.min())},
+        "stiffness": {
+            "name": scale.label,
+            "range": [scale.low, scale.high],
+            "least": scale.low,
+            "colours": np.round(scale.linear_table(), 4).tolist(),
+        },
         "models": [
             {
                 "file": f"{surface.stem}.ply",
@@ -45,3 +51,12 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     }
     write_json(folder / "scene.json", scene)
     write_script(folder / "load_in_slicer.py")
+
+
+def shown_scale(model: FittedModel) -> StiffnessScale:
+    """The colours of the stiffness: those of the report, in ratios where a modulus is known as a ratio alone."""
+    unit, factor = model.unit, 1.0
+    ratios = (item.value / item.ratio for item in model.estimates if item.value and item.ratio)
+    if unit == "kPa" and any(item.verdict == "ratio only" for item in model.estimates):
+        unit, factor = "ratio", 1.0 / next(ratios, 1.0)
+    return stiffness_scale(model.moduli.tolist(), unit=unit, relative_to=model.relative_to, factor=factor)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from palpate.front_door import front_door
 
 if TYPE_CHECKING:
+    from palpate.report.cards import moduli_axes as moduli_axes
     from palpate.report.cards import moduli_figure as moduli_figure
     from palpate.report.cards import result_cards as result_cards
     from palpate.report.cards import result_lines as result_lines

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from typing import Any
 
 import matplotlib as mpl
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from palpate.report.rows import NONE, estimate_rows, interval_text, main_numbers, moduli_in, ratio_rows
-from palpate.report.svg import mark_decades, template_of
+from palpate.report.figures.moduli import chosen_unit, draw_moduli
+from palpate.report.rows import NONE, estimate_rows, moduli_in, ratio_rows
+from palpate.report.svg import template_of
 
-GREY = "#888888"
-ROOM = 1.6  # by which factor the axis reaches beyond all numbers, for the arrows of open ends
+NOTEBOOK_DPI = 110
 STYLE = {"text.parse_math": False, "font.family": "DejaVu Sans"}  # a tissue called $x is a name, not a formula
 
 
@@ -42,44 +44,33 @@ def result_cards(document: Mapping[str, Any], colours: Mapping[str, str]) -> str
     return str(template_of("cards.html").render(document=document, rows=rows, ratios=ratios))
 
 
-def moduli_figure(document: Mapping[str, Any], colours: Mapping[str, str]) -> Figure:
-    """A figure of the moduli (kPa, or ratios) with their 95 % intervals; open ends are arrows, truths dashes.
+class ShownFigure(Figure):
+    """A figure that a notebook shows at the end of a cell, also where pyplot is not used; no window is opened."""
 
-    document, colours: as above. What did not converge is named without a number.
+    def _repr_png_(self) -> bytes:
+        """The picture that a notebook shows."""
+        memory = io.BytesIO()
+        with mpl.rc_context(STYLE):
+            self.savefig(memory, format="png", dpi=NOTEBOOK_DPI)
+        return memory.getvalue()
+
+
+def moduli_figure(document: Mapping[str, Any], colours: Mapping[str, str], unit: str | None = None) -> ShownFigure:
+    """A figure of the moduli with their 95 % intervals; open ends are arrows, truths dashes.
+
+    document, colours: as above; unit: "kPa", "ratio", or None for that of the report. What did not converge is named
+    without a number. Raises `ConfigurationError` for a unit in which there are no numbers.
     """
-    items = moduli_in(document)
+    of = chosen_unit(document, unit)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 1.2 + 0.55 * max(len(items), 1)), layout="constrained")
-        axes = figure.add_subplot()
-        axes.set_xscale("log")
-        numbers = [item["truth"] for item in items]
-        for item in items:
-            value, interval = main_numbers(item)
-            numbers += [value, *(interval or ())]
-        known = [number for number in numbers if number]
-        axes.set_xlim(min(known, default=1.0) / ROOM, max(known, default=1.0) * ROOM)
-        mark_decades(axes.xaxis)
-        ends = axes.get_xlim()
-        for row, item in enumerate(items):
-            value, interval = main_numbers(item)
-            colour = colours.get(item["tissue"], GREY)
-            if item["truth"] is not None:
-                axes.plot([item["truth"]] * 2, [row - 0.3, row + 0.3], color="black", linestyle="--", label="truth")
-            if value is None:
-                where = axes.get_yaxis_transform()
-                axes.text(0.5, row, "no value", transform=where, ha="center", va="center", color=GREY)
-                continue
-            low, high = interval or (value, value)  # a dot alone where no interval is stated
-            line = [low or ends[0], high or ends[1]]
-            axes.plot(line, [row, row], color=colour, linewidth=5, alpha=0.55, gid="interval")
-            for end, marker, place in ((low, "<", ends[0]), (high, ">", ends[1])):
-                if end is None:
-                    axes.plot(place, row, marker=marker, color=colour, markersize=9, clip_on=False, gid="open")
-            words = f"{value:.3g} ({interval_text(interval)})"
-            axes.plot(value, row, "o", color=colour, markeredgecolor="black", label=words)
-        axes.set_yticks(range(len(items)), [f"{item['tissue']}\n{item['verdict']}" for item in items])
-        axes.set_ylim(len(items) - 0.5, -0.5)
-        in_kpa = all(item["unit"] == "kPa" for item in items)
-        axes.set_xlabel("Young's modulus (kPa), 95 % interval" if in_kpa else "ratio of moduli, 95 % interval")
-        axes.grid(visible=True, axis="x", alpha=0.3)
+        figure = ShownFigure(figsize=(6.4, 1.2 + 0.6 * max(len(moduli_in(document)), 1)), layout="constrained")
+        draw_moduli(figure.add_subplot(), document, colours, of)
     return figure
+
+
+def moduli_axes(axes: Axes, document: Mapping[str, Any], colours: Mapping[str, str], unit: str | None = None) -> Axes:
+    """The same drawn on axes, which are given back; raises as above."""
+    of = chosen_unit(document, unit)
+    with mpl.rc_context(STYLE):
+        draw_moduli(axes, document, colours, of)
+    return axes

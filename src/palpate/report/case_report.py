@@ -37,13 +37,7 @@ def redrawn_page(folder: Path, *, document: Mapping[str, Any], sha256: str | Non
     data are missing, damaged, or of another run, when they cannot be drawn, and when the document says other numbers
     than they do.
     """
-    path = folder / DATA
-    data = ReportData.load(path, sha256=sha256)
-    if seal_of(data.document) != seal_of(document):
-        raise InputDataError(
-            f"the numbers in {folder / RESULT} are not those of the run that wrote {DATA}: one was changed since;"
-            " run the estimate again"
-        )
+    data, path = data_of(folder, document=document, sha256=sha256), folder / DATA
     try:
         return render(data, study=study)
     except MemoryError:
@@ -53,6 +47,21 @@ def redrawn_page(folder: Path, *, document: Mapping[str, Any], sha256: str | Non
             f"{path} holds data of which no page can be made ({type(error).__name__}:"
             f" {printable(str(error)[:200])}); run the estimate again"
         ) from error
+
+
+def data_of(folder: Path, *, document: Mapping[str, Any], sha256: str | None = None) -> ReportData:
+    """What report-data.npz in `folder` holds, which must have the SHA-256 that is given.
+
+    document: the result.json beside it. Raises `InputDataError` when the data are missing, damaged or of another run,
+    and when the document says other numbers than they do.
+    """
+    data = ReportData.load(folder / DATA, sha256=sha256)
+    if seal_of(data.document) != seal_of(document):
+        raise InputDataError(
+            f"the numbers in {folder / RESULT} are not those of the run that wrote {DATA}: one was changed since;"
+            " run the estimate again"
+        )
+    return data
 
 
 def _write(data: ReportData, folder: Path) -> Path:

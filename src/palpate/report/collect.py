@@ -49,6 +49,7 @@ RIGID_TRIANGLES = 12_000
 ALL_TRIANGLES = 300_000  # of all surfaces of the images, so that the page stays small
 NONE: tuple[TriangleSurface, ...] = ()
 NO_MAPS: tuple[TissueMap, ...] = ()
+STILL = np.zeros((0, 3), dtype=np.float32)  # the motion where none was fitted
 NOT_MEASURED: tuple[MeasuredState, ...] = ()
 
 
@@ -296,7 +297,16 @@ def _later(drawing: _Drawing, after: int, reference: Reference) -> LaterImage:
         bones=attempt.part(
             f"alignment of {name}", lambda: bone_distances(result, after, reference.surfaces, surfaces), ()
         ),
+        motion=attempt.part(f"motion of {name}", lambda: _motion(drawing, after), STILL),
     )
+
+
+def _motion(drawing: _Drawing, after: int) -> NDArray[np.float32]:
+    """Fitted motion (n_nodes, 3) mm of the nodes of the first reference state's mesh; (0, 3) where there is none."""
+    result = drawing.pair.result
+    if drawing.number or after >= len(result.estimation.displacements):
+        return STILL
+    return result.estimation.displacements[after][: len(result.space.mesh.nodes)].astype(np.float32)
 
 
 def _mesh(result: CaseResult) -> MeshPicture:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import resources
@@ -32,9 +32,18 @@ from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png, points_png
 from palpate.report.report_data import LaterImage, MeasuredState, ReportData, SliceBox, TissueMap
 from palpate.report.rows import estimate_rows, headline, moduli_in, ratio_rows, scale_marks
-from palpate.report.scales import angle_scale, distance_scale, modulus_scale, strain_scale
-from palpate.report.section import VIEWS
-from palpate.report.slices import alignment_svg, contour_names, first_planes, points_svg, slice_svg
+from palpate.report.scales import angle_scale, displacement_scale, distance_scale, modulus_scale, strain_scale
+from palpate.report.section import VIEWS, Plane
+from palpate.report.slices import (
+    alignment_svg,
+    arrow_factor,
+    contour_names,
+    displacement_svg,
+    first_planes,
+    points_svg,
+    slice_svg,
+    stiffness_svg,
+)
 from palpate.report.stiffness_maps import map_png, map_svg
 from palpate.report.summary import summary
 from palpate.report.svg import template_of
@@ -43,7 +52,10 @@ from palpate.report.units import given_text, shown_correlation, shown_unit
 
 T = TypeVar("T")
 LOGGER = logging.getLogger(__name__)
-SCRIPTS = ("three.min.js", "report.js", "slices.js", "alignment.js", "viewer.js", "organs.js", "mesh.js", "start.js")
+SCRIPTS = (
+    *("three.min.js", "report.js", "save.js", "field.js", "slices.js", "alignment.js", "viewer.js", "organs.js"),
+    *("mesh.js", "start.js"),
+)
 OF_POINTS = "points.js"  # before the last, where points were measured
 COSTS: tuple[tuple[str, Callable[[str], bool]], ...] = (  # a code that is not ours may cost as much as any
     (
@@ -208,6 +220,7 @@ def _later(data: ReportData, k: int, later: LaterImage) -> Mapping[str, Any]:
             picture_of(plane.view.name, partial(slice_svg, data, plane, later, name=f"s{k}{plane.view.name}"))
             for plane in planes
         ),
+        "fields": tuple(_fields(data, k, later, planes)),
         "organs": _photographs(
             {
                 f"as in {reference.name}": partial(organs_png, data, later, fitted=False),
@@ -225,6 +238,39 @@ def _later(data: ReportData, k: int, later: LaterImage) -> Mapping[str, Any]:
         "reference": reference,
         "widths": widths_of(reference.slices),
     }
+
+
+def _fields(data: ReportData, k: int, later: LaterImage, planes: Sequence[Plane]) -> Iterator[Mapping[str, Any]]:
+    """What the model found in colours over the slices of one later image: moduli, and the fitted motion."""
+    if data.mesh is None or later.reference or not planes:
+        return
+
+    def pictures(draw: Callable[..., str], letter: str) -> tuple[Picture, ...]:
+        """One of each plane."""
+        names = [f"{letter}{k}{plane.view.name}" for plane in planes]
+        drawn = zip(planes, names, strict=True)
+        return tuple(picture_of(p.view.name, partial(draw, data, p, later, name=name)) for p, name in drawn)
+
+    if any(tissue.modulus and tissue.role == "estimate" for tissue in data.tissues):
+        words = "Coloured: the organs whose modulus was estimated. A modulus that was given is only marked on the bar."
+        yield {
+            "of": "stiffness",
+            "title": "Young's modulus",
+            "words": words,
+            "pictures": pictures(stiffness_svg, "e"),
+            "scale": modulus_scale(data),
+        }
+    if len(later.motion):
+        factor = arrow_factor(later)
+        longer = "as long as the motion" if factor == 1.0 else f"{factor:g} times as long as the motion"
+        yield {
+            "of": "motion",
+            "title": "displacement",
+            "words": f"Coloured: the length of the fitted motion to {later.name}. White arrows, {longer}, show its part"
+            " in the slice.",
+            "pictures": pictures(displacement_svg, "d"),
+            "scale": displacement_scale(later),
+        }
 
 
 def _measured(data: ReportData, k: int, state: MeasuredState) -> Mapping[str, Any]:

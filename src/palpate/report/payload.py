@@ -13,6 +13,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from palpate.report.cut_mesh import element_moduli
 from palpate.report.preview_data import ROLE_COLOURS, PreviewImage
 from palpate.report.report_data import (
     GREY_STEPS,
@@ -24,8 +25,17 @@ from palpate.report.report_data import (
     TriangleSurface,
     Volume,
 )
-from palpate.report.scales import Scale, angle_scale, distance_scale, modulus_scale, strain_scale
+from palpate.report.scales import (
+    Scale,
+    angle_scale,
+    displacement_scale,
+    distance_scale,
+    modulus_scale,
+    shown_moduli,
+    strain_scale,
+)
 from palpate.report.section import VIEWS
+from palpate.report.slices import arrow_factor
 
 MOST_TETS = 120_000  # of a mesh that a page can turn
 LEVELS = 65_535
@@ -92,7 +102,10 @@ def payload(data: ReportData, preview: Sequence[PreviewImage] = ()) -> Payload:
         "low": low.tolist(),
         "step": step,
         "unit": data.unit,
-        "tissues": [{"name": t.name, "role": t.role, "colour": t.colour, "modulus": t.modulus} for t in data.tissues],
+        "tissues": [
+            {"name": tissue.name, "role": tissue.role, "colour": tissue.colour, "modulus": modulus}
+            for tissue, modulus in zip(data.tissues, _shown(data), strict=True)
+        ],
         "views": [
             {"name": v.name, "normal": v.normal, "across": v.across, "up": v.up, "letters": v.letters} for v in VIEWS
         ],
@@ -117,13 +130,32 @@ def payload(data: ReportData, preview: Sequence[PreviewImage] = ()) -> Payload:
             "worst": packer.add(np.clip(mesh.angles.min(axis=1), 0.0, 255.0).astype(np.uint8)),
             "strain": packer.add(np.clip(np.rint(100.0 * mesh.strains / STRAIN_STEP), 0.0, 255.0).astype(np.uint8)),
             "strainStep": STRAIN_STEP,
+            "modulus": packer.add(_element_moduli(data)),
         },
         "angles": _scale(angle_scale()),
         "strains": _scale(strain_scale()),
-        "moduli": _scale(modulus_scale(data)) if any(t.modulus for t in data.tissues) else None,
+        "moduli": _scale(modulus_scale(data)) if _has_moduli(data) else None,
     }
     block = zlib.compress(b"".join(packer.chunks), 9)
     return Payload(script_json(facts), Markup(base64.b64encode(block).decode()))  # noqa: S704 - base64's own letters
+
+
+def _has_moduli(data: ReportData) -> bool:
+    return any(tissue.modulus for tissue in data.tissues)
+
+
+def _shown(data: ReportData) -> list[float | None]:
+    """The tissues' moduli in the unit that is shown, None where there is none."""
+    if not _has_moduli(data):
+        return [None] * len(data.tissues)
+    return [float(modulus) if np.isfinite(modulus) else None for modulus in shown_moduli(data)]
+
+
+def _element_moduli(data: ReportData) -> NDArray[np.float32]:
+    """Young's modulus (n_tets,) of each element in the unit that is shown; NaN where none was found."""
+    if data.mesh is None or not _has_moduli(data):
+        return np.zeros(0, np.float32)
+    return element_moduli(data).astype(np.float32)
 
 
 def script_json(value: Any) -> Markup:
@@ -199,6 +231,18 @@ def _later(data: ReportData, later: LaterImage, packer: _Packer) -> dict[str, An
             for model in later.model
         ],
         "scale": _scale(distance_scale(data.references[later.reference].voxel_mm)),
+        "motion": _motion(later, packer) if len(later.motion) else None,
+    }
+
+
+def _motion(later: LaterImage, packer: _Packer) -> dict[str, Any]:
+    """The fitted motion of the mesh's nodes in steps of 16 bits, its scale, and how much longer arrows are drawn."""
+    step = max(float(np.abs(later.motion).max()) / 32_767, 1e-9)
+    return {
+        "values": packer.add(np.rint(later.motion / step).astype(np.int16)),
+        "step": step,
+        "scale": _scale(displacement_scale(later)),
+        "factor": arrow_factor(later),
     }
 
 

@@ -12,7 +12,7 @@ from palpate.mesh import outer_faces
 from palpate.mesh.surface import triangle_normals, vertex_normals
 from palpate.report.render import Arrows, Camera, Triangles, render_png
 from palpate.report.report_data import LaterImage, MeasuredState, MeshPicture, ReportData
-from palpate.report.scales import distance_scale, modulus_scale, strain_scale
+from palpate.report.scales import distance_scale, modulus_scale, shown_moduli, strain_scale
 
 WIDTH, HEIGHT = 620, 460
 BESIDE = Camera.looking((-1.0, 0.3, 0.15))  # the patient's left side, a little from the front
@@ -21,8 +21,11 @@ BESIDE_FRONT = Camera.looking((-1.0, 0.6, 0.35))
 SEEN, FITTED = ("#c98b00", 4.0), ("#1f6fd6", 2.0)  # colour of arrows, and how many pixels thick
 
 
-def organs_png(data: ReportData, later: LaterImage, *, fitted: bool) -> bytes:
-    """The model's organs, as fitted to `later` or at rest, coloured by their signed distance to that image; PNG."""
+def organs_png(data: ReportData, later: LaterImage, *, fitted: bool, size: tuple[int, int] | None = None) -> bytes:
+    """The model's organs, as fitted to `later` or at rest, coloured by their signed distance to that image; PNG.
+
+    size: its width and height in pixels; None: those of the page.
+    """
     if not later.model:
         raise ValueError("there is no fitted model")
     scale = distance_scale(data.references[later.reference].voxel_mm)
@@ -34,7 +37,8 @@ def organs_png(data: ReportData, later: LaterImage, *, fitted: bool) -> bytes:
         colours.append(scale.colours(distance)[model.triangles])
         normals.append(vertex_normals(points, model.triangles.astype(np.int64))[model.triangles])
     triangles = Triangles(np.concatenate(corners), np.concatenate(colours), np.concatenate(normals))
-    return render_png(triangles, BESIDE, width=WIDTH, height=HEIGHT)
+    width, height = size or (WIDTH, HEIGHT)
+    return render_png(triangles, BESIDE, width=width, height=height)
 
 
 def points_png(data: ReportData, state: MeasuredState) -> bytes:
@@ -72,8 +76,7 @@ def mesh_png(data: ReportData, *, by: Literal["tissue", "modulus", "strain"]) ->
     if by == "strain":
         shades = strain_scale().colours(100.0 * mesh.strains[tets].astype(np.float64))
     elif by == "modulus":
-        moduli = [np.nan if tissue.modulus is None else tissue.modulus for tissue in data.tissues]
-        shades = modulus_scale(data).colours(np.array(moduli, dtype=np.float64))[mesh.region[tets]]
+        shades = modulus_scale(data).colours(shown_moduli(data))[mesh.region[tets]]
     else:
         shades = np.array([to_rgb(tissue.colour) for tissue in data.tissues])[mesh.region[tets]]
     corners = mesh.nodes.astype(np.float64)[faces]

@@ -132,7 +132,8 @@ class LaterImage:
 
     reference: number of its reference state; outlines: the reference state's surfaces of what moves, carried by the
     fitted motion; both: the whole of the reference state's image and of this one, of one kind; bones: of every rigid
-    tissue that both show.
+    tissue that both show; motion (n_nodes, 3) mm: of the nodes of `ReportData.mesh` as fitted to this image, (0, 3)
+    where nothing was fitted or the mesh is that of another reference state.
     """
 
     name: str
@@ -143,6 +144,7 @@ class LaterImage:
     outlines: tuple[TriangleSurface, ...] = ()
     both: tuple[Volume, ...] = ()
     bones: tuple[BoneDistance, ...] = ()
+    motion: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), dtype=np.float32))
 
 
 @dataclass(frozen=True, slots=True)

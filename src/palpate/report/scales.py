@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from palpate.report.report_data import ReportData
+from palpate.report.report_data import LaterImage, ReportData
 from palpate.report.ticks import log_marks, mark_text
 from palpate.report.units import shown_unit
 from palpate.study.refusals import LINEAR_RANGE
+from palpate.study.stiffness_scale import COLOURS, StiffnessScale, stiffness_scale
 
 MOST_TICKS = 6  # of a colour bar whose marks are moduli
 UNSEEN = (0.62, 0.63, 0.66)  # where there is no value
@@ -72,18 +74,33 @@ def distance_scale(voxel_mm: float) -> Scale:
 
 
 def modulus_scale(data: ReportData) -> Scale:
-    """Young's modulus of the meshed tissues, logarithmic, with marks in the unit that the page shows.
+    """Young's modulus of the meshed tissues, logarithmic, in the unit that is shown; raises `ValueError` for none."""
+    of = shown_stiffness(data)
+    marks = log_marks(of.low, of.high, most=MOST_TICKS)
+    return Scale(COLOURS, of.low, of.high, True, of.label, tuple((mark, mark_text(mark)) for mark in marks))
 
-    low, high: in the result's unit. Raises `ValueError` when no tissue has a modulus.
-    """
-    values = sorted(tissue.modulus for tissue in data.tissues if tissue.modulus is not None and tissue.modulus > 0)
-    if not values:
-        raise ValueError("no tissue has a modulus")
-    room = max((values[-1] / values[0]) ** 0.12, 1.15)
-    low, high, unit = values[0] / room, values[-1] * room, shown_unit(data.document)
-    marks = log_marks(unit.of_document(low), unit.of_document(high), most=MOST_TICKS)
-    factor = low / unit.of_document(low)
-    return Scale("viridis", low, high, True, unit.axis, tuple((mark * factor, mark_text(mark)) for mark in marks))
+
+def shown_stiffness(data: ReportData) -> StiffnessScale:
+    """In which unit and between which limits moduli are shown; raises `ValueError` where no tissue has one."""
+    unit, moduli = shown_unit(data.document), [tissue.modulus for tissue in data.tissues]
+    mapped = np.concatenate([np.zeros(0, np.float32), *(of.moduli for of in data.maps)])
+    to, factor = unit.relative_to, unit.of_document(1.0)
+    return stiffness_scale(moduli, unit=unit.name, relative_to=to, factor=factor, mapped=mapped)
+
+
+def shown_moduli(data: ReportData) -> NDArray[np.float64]:
+    """Young's modulus (n_tissues,) of each tissue in the unit of `modulus_scale`; NaN where there is none."""
+    moduli = np.array([np.nan if tissue.modulus is None else tissue.modulus for tissue in data.tissues])
+    return np.asarray(shown_stiffness(data).factor * moduli.astype(np.float64))
+
+
+def displacement_scale(later: LaterImage) -> Scale:
+    """Length of the fitted motion to a later image, from 0 to a round number of mm that nothing exceeds by much."""
+    lengths = np.linalg.norm(later.motion.astype(np.float64), axis=1)
+    top = float(np.percentile(lengths, 99.9)) if len(lengths) else 0.0
+    places = [float(t) for t in MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, max(top, 1e-3))]
+    ticks = tuple((place, f"{place:g}") for place in places)
+    return Scale("plasma", 0.0, places[-1], False, "fitted motion (mm)", ticks)
 
 
 def angle_scale() -> Scale:

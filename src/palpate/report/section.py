@@ -65,12 +65,19 @@ class Plane:
         return np.asarray(np.linspace(self.low[axis], self.high[axis], count))
 
 
-def cut_image(values: NDArray[Any], grid: VoxelGrid, plane: Plane, *, order: Literal[0, 1] = 1) -> NDArray[np.float64]:
+def cut_image(
+    values: NDArray[Any],
+    grid: VoxelGrid,
+    plane: Plane,
+    *,
+    order: Literal[0, 1] = 1,
+    points: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
     """Values (n_up, n_across) of a field (n_x, n_y, n_z) on the plane's pixels; NaN outside its grid.
 
-    order 0: nearest voxel.
+    order 0: nearest voxel; points (n_up, n_across, 3) RAS mm: what the pixels show, in the place of the plane's points.
     """
-    points = plane.points
+    points = plane.points if points is None else points
     index = grid.index(points.reshape(-1, 3))
     window = window_of(index, grid, margin=2)
     origin = np.array([axis.start for axis in window])

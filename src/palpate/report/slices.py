@@ -1,4 +1,4 @@
-"""Three orthogonal slices with the organs' contours before, after and in the fitted model, for paper."""
+"""Three orthogonal slices for paper: contours before, after and in the fitted model; Young's modulus; displacement."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
+from palpate.report.cut_mesh import cut_mesh, element_moduli, motion_of
+from palpate.report.measured import nice_factor
 from palpate.report.report_data import (
     LaterImage,
     MeasuredPoints,
@@ -21,10 +23,15 @@ from palpate.report.report_data import (
     TriangleSurface,
     Volume,
 )
+from palpate.report.scales import Scale, displacement_scale, modulus_scale
 from palpate.report.section import VIEWS, Plane, cut_image, joined
 from palpate.report.svg import draw_svg
 
 WIDTH_INCHES = 4.6
+FADED = 0.15  # part of the scale of displacements in which the colours fade, so that what stands still stays grey
+LEAST_ARROW_MM = 1.5  # as it is drawn
+OPACITY = 0.6  # of what is coloured, over the image
+ARROW_STEP_MM, ARROW_REACH = 9.0, 13.0  # between arrows of the motion; of ten steps, how long most of them are at most
 SEEN, FITTED = ("#f0e442", 0.045), ("#4da3ff", 0.018)  # colour and width (inches) of arrows on black
 ROLE_LEVELS = {"rigid": 1.0, "estimate": 0.6, "driver": 0.4, "known": 0.2, "void": 0.0}  # bones are what is aligned
 OUTLINE = (withStroke(linewidth=1.5, foreground="#000000", alpha=0.7),)  # letters stay readable on bright bone
@@ -52,17 +59,97 @@ def slice_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str, m
         """Grey values, contours and furniture, one over the other."""
         axes = _backed(figure, data, reference.background, plane)
         for surface in later.surfaces:
-            _lines(axes, data, plane, surface, gid="layer-after", linewidth=4.0, alpha=0.5)
+            draw_lines(axes, data, plane, surface, gid="layer-after", linewidth=4.0, alpha=0.5)
         for surface in reference.surfaces:
-            _lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0, linestyle=(0, (1, 1.6)))
+            draw_lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0, linestyle=(0, (1, 1.6)))
         for outline in later.outlines:
-            _lines(axes, data, plane, outline, gid="layer-model", colors=["white"], linewidth=1.0)
-        _furnish(axes, plane)
+            draw_lines(axes, data, plane, outline, gid="layer-model", colors=["white"], linewidth=1.0)
+        furnish(axes, plane)
 
-    where = f"{plane.view.name.capitalize()} slice at {'xyz'[plane.view.normal]} = {plane.position:.0f} mm"
+    where = _where(plane)
     outlines = f"{reference.name}, {later.name} and the fitted model" if model else f"{reference.name} and {later.name}"
     says = f"{where}: {reference.name} under the outlines of {outlines}."
     return draw_svg(draw, size=_size(plane), name=name, says=says)
+
+
+def stiffness_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -> str:
+    """One slice as SVG: the earlier image under the Young's moduli that were found, and the organs' contours there.
+
+    Raises `ValueError` where there is no mesh of this image, or no modulus.
+    """
+    if later.reference:
+        raise ValueError("the mesh that is kept is that of the first pair of images")
+    scale, values = modulus_scale(data), stiffness_on(data, plane)
+
+    def draw(figure: Figure) -> None:
+        """Grey values under colours, contours and furniture."""
+        reference = data.references[later.reference]
+        axes = figure.add_axes((0, 0, 1, 1))
+        show_shades(axes, plane, coloured(shades_of(data, reference.background, plane), values, scale))
+        for surface in reference.surfaces:
+            draw_lines(axes, data, plane, surface, gid="layer-before", linewidth=1.2)
+        furnish(axes, plane)
+
+    says = f"{_where(plane)}: {scale.label} over {data.references[later.reference].name}."
+    return draw_svg(draw, size=_size(plane), name=name, says=says)
+
+
+def displacement_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -> str:
+    """One slice as SVG: the earlier image under the length of the fitted motion, and arrows of its part in the plane.
+
+    Raises `ValueError` where there is no mesh of this image, or no motion.
+    """
+    scale, factor = displacement_scale(later), arrow_factor(later)
+    motion = motion_on(data, plane, later)
+
+    def draw(figure: Figure) -> None:
+        """Grey values under colours, contours, arrows and furniture."""
+        reference = data.references[later.reference]
+        axes = figure.add_axes((0, 0, 1, 1))
+        shades = shades_of(data, reference.background, plane)
+        show_shades(axes, plane, coloured(shades, np.linalg.norm(motion, axis=2), scale, full=FADED))
+        for surface in reference.surfaces:
+            draw_lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0)
+        motion_arrows(axes, plane, motion, factor)
+        furnish(axes, plane)
+
+    says = f"{_where(plane)}: fitted motion from {data.references[later.reference].name} to {later.name}, up to"
+    return draw_svg(draw, size=_size(plane), name=name, says=f"{says} {scale.high:.3g} mm.")
+
+
+def stiffness_on(data: ReportData, plane: Plane) -> NDArray[np.float64]:
+    """Young's modulus (n_up, n_across) of what was estimated, in the unit that is shown, on a plane; NaN elsewhere.
+
+    The plane is one of the first reference state. Raises `ValueError` where there is no mesh or no modulus.
+    """
+    return cut_mesh(data, plane).of_elements(element_moduli(data))
+
+
+def motion_on(data: ReportData, plane: Plane, later: LaterImage) -> NDArray[np.float64]:
+    """The fitted motion (n_up, n_across, 3) mm on a plane, NaN outside the mesh; raises as `motion_of` does."""
+    return cut_mesh(data, plane).of_nodes(motion_of(later))
+
+
+def arrow_factor(later: LaterImage) -> float:
+    """How many times longer than the fitted motion its arrows are drawn, so that neighbours do not hide each other."""
+    lengths = np.linalg.norm(motion_of(later), axis=1)
+    return nice_factor(lengths[lengths > 0.0] if (lengths > 0.0).any() else lengths, ARROW_REACH * ARROW_STEP_MM)
+
+
+def motion_arrows(axes: Axes, plane: Plane, motion: NDArray[np.float64], factor: float, *, small: bool = False) -> None:
+    """Arrows of a motion (n_up, n_across, 3) mm on a plane, one every `ARROW_STEP_MM`, `factor` times as long.
+
+    small: thinner ones, in a figure for paper.
+    """
+    across, up = plane.axes
+    step = max(round(ARROW_STEP_MM / float(across[1] - across[0])), 1)
+    rows, columns = np.meshgrid(*(np.arange(step // 2, n, step) for n in motion.shape[:2]), indexing="ij")
+    way = motion[rows, columns]
+    inside = factor * np.linalg.norm(np.nan_to_num(way), axis=2) > LEAST_ARROW_MM
+    feet = np.zeros((int(inside.sum()), 3))
+    feet[:, plane.view.across], feet[:, plane.view.up] = across[columns[inside]], up[rows[inside]]
+    for colour, width in (("#000000", 0.028), ("#ffffff", 0.014)):  # white arrows with a dark rim
+        _arrows(axes, plane, feet, factor * way[inside], (colour, 0.5 * width if small else width), "layer-motion")
 
 
 def points_svg(data: ReportData, plane: Plane, state: MeasuredState, *, name: str) -> str:
@@ -75,16 +162,16 @@ def points_svg(data: ReportData, plane: Plane, state: MeasuredState, *, name: st
         """Grey values, contours, arrows and furniture, one over the other."""
         axes = _backed(figure, data, reference.background, plane)
         for surface in reference.surfaces:
-            _lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0, linestyle=(0, (1, 1.6)))
+            draw_lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0, linestyle=(0, (1, 1.6)))
         for outline in state.outlines:
-            _lines(axes, data, plane, outline, gid="layer-model", colors=["white"], linewidth=1.0)
+            draw_lines(axes, data, plane, outline, gid="layer-model", colors=["white"], linewidth=1.0)
         for of in state.points:
             here = _near(of, plane)
             _arrows(axes, plane, of.rest[here], state.motion_factor * of.observed[here], SEEN, "layer-seen")
             _arrows(axes, plane, of.rest[here], state.motion_factor * of.fitted[here], FITTED, "layer-fitted")
-        _furnish(axes, plane)
+        furnish(axes, plane)
 
-    where = f"{plane.view.name.capitalize()} slice at {'xyz'[plane.view.normal]} = {plane.position:.0f} mm"
+    where = _where(plane)
     says = f"{where}: measured and fitted motion of {near} points near it, as arrows."
     return draw_svg(draw, size=_size(plane), name=name, says=says)
 
@@ -104,11 +191,16 @@ def alignment_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: st
         across, up = plane.axes
         both = np.stack([second, first, first], axis=2)
         axes.imshow(both, extent=(across[0], across[-1], up[0], up[-1]), origin="lower", interpolation="none")
-        _furnish(axes, plane)
+        furnish(axes, plane)
 
     reference = data.references[later.reference].name
     says = f"{plane.view.name.capitalize()} slice: {reference} in cyan over {later.name} in red; what agrees is grey."
     return draw_svg(draw, size=_size(plane), name=name, says=says)
+
+
+def _where(plane: Plane) -> str:
+    """Which slice it is, in words."""
+    return f"{plane.view.name.capitalize()} slice at {'xyz'[plane.view.normal]} = {plane.position:.0f} mm"
 
 
 def _size(plane: Plane) -> tuple[float, float]:
@@ -117,40 +209,75 @@ def _size(plane: Plane) -> tuple[float, float]:
     return WIDTH_INCHES, WIDTH_INCHES * up / across
 
 
-def _furnish(axes: Axes, plane: Plane) -> None:
-    """Letters of the sides, a bar of millimetres, and where the plane lies."""
-    view = plane.view
+def furnish(axes: Axes, plane: Plane, *, small: bool = False) -> None:
+    """Letters of the sides, a bar of millimetres, and where the plane lies.
+
+    small: in a figure for paper, whose title tells where it lies.
+    """
+    view, size = plane.view, 6.0 if small else 8.0
     axes.set_xlim(plane.high[view.across], plane.low[view.across])
     axes.set_ylim(plane.low[view.up], plane.high[view.up])
     axes.set_axis_off()
-    places = ((0.025, 0.5), (0.975, 0.5), (0.5, 0.97), (0.5, 0.03))
+    edge = 0.04 if small else 0.025
+    places = ((edge, 0.5), (1.0 - edge, 0.5), (0.5, 0.97 - edge + 0.025), (0.5, 0.03 + edge - 0.025))
     for letter, (x, y) in zip(view.letters, places, strict=True):
-        _write(axes, x, y, letter, ha="center", va="center", fontweight="bold")
-    where = f"{'xyz'[view.normal]} = {plane.position:.0f} mm"
-    _write(axes, 0.975, 0.03, where, ha="right", va="center", fontsize=7)
+        _write(axes, x, y, letter, ha="center", va="center", fontweight="bold", fontsize=size + 1.0)
+    if not small:
+        where = f"{'xyz'[view.normal]} = {plane.position:.0f} mm"
+        _write(axes, 0.975, 0.03, where, ha="right", va="center", fontsize=7)
     width = float(plane.high[view.across] - plane.low[view.across])
     bar = next(size for size in (50.0, 20.0, 10.0, 5.0, 1.0, 0.0) if size < 0.4 * width)
     left, bottom = plane.high[view.across] - 0.06 * width, plane.low[view.up] + 0.06 * width
     stroke = [withStroke(linewidth=3.4, foreground="#000000")]
     ends = [left, left - bar]
-    axes.plot(ends, [bottom] * 2, color="white", linewidth=2.0, solid_capstyle="butt", path_effects=stroke)
+    wide = 1.2 if small else 2.0
+    axes.plot(ends, [bottom] * 2, color="white", linewidth=wide, solid_capstyle="butt", path_effects=stroke)
     place = (left, bottom + 0.015 * width)
-    axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=8, path_effects=OUTLINE)
+    axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=size, path_effects=OUTLINE)
 
 
 def _backed(figure: Figure, data: ReportData, volume: Volume | None, plane: Plane) -> Axes:
     """Axes that fill the figure, with a volume on the plane: its window of greys, its tissues' colours, or black."""
     axes = figure.add_axes((0, 0, 1, 1))
-    across, up = plane.axes
-    shades = np.zeros((2, 2, 3))
-    if volume is not None and volume.kind == "grey":
-        shades = np.repeat(_brightness(data, volume, plane)[..., None], 3, axis=2)
-    elif volume is not None:
-        colours = [(0.0, 0.0, 0.0), *(0.06 + 0.3 * np.array(to_rgb(tissue.colour)) for tissue in data.tissues)]
-        steps = np.nan_to_num(cut_image(volume.values, volume.grid, plane, order=0))
-        shades = np.array(colours)[np.rint(steps).astype(int)]
-    axes.imshow(shades, extent=(across[0], across[-1], up[0], up[-1]), origin="lower", interpolation="none")
+    show_shades(axes, plane, shades_of(data, volume, plane))
     return axes
+
+
+def show_shades(axes: Axes, plane: Plane, shades: NDArray[np.float64]) -> None:
+    """Draw colours (n_up, n_across, 3), 0 to 1, where the plane lies."""
+    across, up = plane.axes
+    axes.imshow(shades, extent=(across[0], across[-1], up[0], up[-1]), origin="lower", interpolation="none")
+
+
+def shades_of(
+    data: ReportData, volume: Volume | None, plane: Plane, *, points: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Colours (n_up, n_across, 3), 0 to 1, of a volume on a plane: greys in its window, dark tissues, or black.
+
+    points (n_up, n_across, 3) RAS mm: what the pixels show, in the place of the plane's points.
+    """
+    if volume is None:
+        return np.zeros((*plane.points.shape[:2], 3))
+    if volume.kind == "grey":
+        return np.repeat(_brightness(data, volume, plane, points)[..., None], 3, axis=2)
+    colours = [(0.0, 0.0, 0.0), *(0.06 + 0.3 * np.array(to_rgb(tissue.colour)) for tissue in data.tissues)]
+    steps = np.nan_to_num(cut_image(volume.values, volume.grid, plane, order=0, points=points))
+    return np.asarray(np.array(colours)[np.rint(steps).astype(int)])
+
+
+def coloured(
+    shades: NDArray[np.float64], values: NDArray[np.float64], scale: Scale, *, full: float = 0.0
+) -> NDArray[np.float64]:
+    """Shades (n_up, n_across, 3) under the colours of values (n_up, n_across), in the scale's unit; NaN: left as is.
+
+    full: from which part of the scale on the colours are as strong as they get; below it they fade.
+    """
+    colours = scale.colours(values.ravel()).reshape(shades.shape)
+    strength = np.ones(values.shape)
+    if full:
+        strength = np.clip(scale.place(values.ravel()).reshape(values.shape) / full, 0.0, 1.0)
+    share = np.where(np.isfinite(values), OPACITY * strength, 0.0)[..., None]
+    return np.asarray((1.0 - share) * shades + share * colours)
 
 
 def _near(of: MeasuredPoints, plane: Plane) -> NDArray[np.bool_]:
@@ -161,8 +288,8 @@ def _near(of: MeasuredPoints, plane: Plane) -> NDArray[np.bool_]:
 def _arrows(
     axes: Axes,
     plane: Plane,
-    rest: NDArray[np.float32],
-    way: NDArray[np.float32],
+    rest: NDArray[np.floating],
+    way: NDArray[np.floating],
     style: tuple[str, float],
     gid: str,
 ) -> None:
@@ -173,16 +300,22 @@ def _arrows(
         axes.quiver(*places, color=style[0], width=style[1], zorder=3.0, **options).set_gid(gid)
 
 
-def _brightness(data: ReportData, volume: Volume, plane: Plane) -> NDArray[np.float64]:
-    """Brightness (n_up, n_across), 0 to 1: of a volume's greys in its window, or of its tissues by their role."""
+def _brightness(
+    data: ReportData, volume: Volume, plane: Plane, points: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Brightness (n_up, n_across), 0 to 1: of a volume's greys in its window, or of its tissues by their role.
+
+    points (n_up, n_across, 3) RAS mm: as in `shades_of`.
+    """
     if volume.kind == "grey":
-        return volume.shade(np.nan_to_num(cut_image(volume.values, volume.grid, plane)))
+        return volume.shade(np.nan_to_num(cut_image(volume.values, volume.grid, plane, points=points)))
     levels = np.array([0.0, *(ROLE_LEVELS[tissue.role] for tissue in data.tissues)])
     steps = np.nan_to_num(cut_image(volume.values, volume.grid, plane, order=0))
     return np.asarray(levels[np.rint(steps).astype(int)])
 
 
-def _lines(axes: Axes, data: ReportData, plane: Plane, surface: TriangleSurface, *, gid: str, **style: Any) -> None:
+def draw_lines(axes: Axes, data: ReportData, plane: Plane, surface: TriangleSurface, *, gid: str, **style: Any) -> None:
+    """Where a surface crosses the plane, in its tissue's colour unless `style` says otherwise."""
     lines = joined(surface.points.astype(np.float64), surface.triangles.astype(np.int64), plane)
     collection = LineCollection(
         lines, **{"colors": [data.tissues[surface.tissue].colour], "capstyle": "round", "joinstyle": "round"} | style

@@ -5,6 +5,7 @@ Where the data removed less than half of what was not known, a slice is hatched 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,15 +20,16 @@ from palpate.mesh.locate import located
 from palpate.report.pictures import BESIDE_FRONT, HEIGHT, WIDTH, face_normals, section_faces
 from palpate.report.render import Triangles, render_png
 from palpate.report.report_data import MapSlice, ReportData, TissueMap
-from palpate.report.scales import Scale
+from palpate.report.scales import Scale, shown_stiffness
 from palpate.report.section import VIEWS, Plane
 from palpate.report.svg import INK, draw_svg
 from palpate.study.map_words import RESOLVED, map_words
 from palpate.study.result import CaseResult
+from palpate.study.stiffness_scale import StiffnessScale
 
 ROOM_MM = 3.0  # round the tissue
 COLOURS = "cividis"  # which is read alike by who sees no red or green
-FACTORS = (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0)
+FACTORS, DECADE, CLOSE = (1.0, 1.2, 1.5, 2.0, 3.0, 5.0), (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0), 5.0
 SIDE_INCHES = 1.9
 
 
@@ -55,12 +57,15 @@ def tissue_maps(result: CaseResult) -> tuple[TissueMap, ...]:
     return tuple(found)
 
 
-def map_scale(of: TissueMap, unit: str) -> Scale:
-    """Moduli of a map, logarithmic, as far below its tissue's mean as above it, and by a factor of 1.5 at least."""
+def map_scale(of: TissueMap, shown: StiffnessScale) -> Scale:
+    """Moduli of a map, logarithmic, as far below its tissue's mean as above it, and by a factor of 1.5 at least.
+
+    shown: the unit in which the case's moduli are shown.
+    """
+    mean = shown.factor * of.mean
     factor = max(1.5, *np.exp(np.abs(np.log(np.quantile(of.moduli, [0.005, 0.995]) / of.mean))).tolist())
-    label = "Young's modulus (kPa)" if unit == "kPa" else "Young's modulus (ratio)"
-    ends = (of.mean / factor, of.mean, of.mean * factor)
-    return Scale(COLOURS, ends[0], ends[2], True, label, tuple((end, f"{end:.3g}") for end in ends))
+    ends = (mean / factor, mean, mean * factor)
+    return Scale(COLOURS, ends[0], ends[2], True, shown.label, tuple((end, f"{end:.3g}") for end in ends))
 
 
 def map_svg(data: ReportData, of: TissueMap, *, name: str) -> str:
@@ -68,7 +73,15 @@ def map_svg(data: ReportData, of: TissueMap, *, name: str) -> str:
 
     A length of the one colour bar is the same factor as on the other.
     """
-    scale, tissue = map_scale(of, data.unit), data.tissues[of.tissue].name
+    says = f"Slices of the modulus inside {data.tissues[of.tissue].name}, and of its standard deviation. {of.words}"
+    size = (2.0 * SIDE_INCHES + 0.6, 3.0 * SIDE_INCHES + 1.2)
+    return draw_svg(map_drawing(data, of), size=size, name=name, says=says)
+
+
+def map_drawing(data: ReportData, of: TissueMap) -> Callable[[Figure], None]:
+    """What paints the slices of a map, and of its standard deviation, on a figure."""
+    shown = shown_stiffness(data)
+    scale = map_scale(of, shown)
     spread = Scale(COLOURS, 1.0, scale.high / scale.low, True, "factor of one standard deviation", ())
 
     def draw(figure: Figure) -> None:
@@ -76,21 +89,21 @@ def map_svg(data: ReportData, of: TissueMap, *, name: str) -> str:
         axes = figure.subplots(3, 2, gridspec_kw={"left": 0.02, "right": 0.98, "top": 0.94, "bottom": 0.14})
         for row, (view, cut) in enumerate(zip(VIEWS, of.slices, strict=True)):
             plane = Plane(view, float(of.position[view.normal]), of.low, of.high)
-            _slice(axes[row, 0], plane, cut, cut.modulus, scale)
+            _slice(axes[row, 0], plane, cut, shown.factor * cut.modulus, scale)
             _slice(axes[row, 1], plane, cut, np.exp(cut.sd), spread)
             axes[row, 0].set_title(f"{view.name}, {'xyz'[view.normal]} = {plane.position:.0f} mm", loc="left")
         for column, of_column in enumerate((scale, spread)):
             bar = figure.add_axes(((0.06 + 0.5 * column), 0.075, 0.38, 0.02))
             mapped = ScalarMappable(LogNorm(of_column.low, of_column.high), of_column.name)
-            places = [place for place, _ in of_column.ticks] or [f for f in FACTORS if f <= of_column.high]
+            factors = FACTORS if of_column.high < CLOSE else DECADE
+            places = [place for place, _ in of_column.ticks] or [f for f in factors if f <= of_column.high]
             drawn = figure.colorbar(mapped, cax=bar, orientation="horizontal", label=of_column.label)
             drawn.ax.xaxis.set_major_locator(FixedLocator(places))
             drawn.ax.xaxis.set_minor_locator(NullLocator())
             drawn.ax.xaxis.set_major_formatter(StrMethodFormatter("{x:.3g}"))
             drawn.ax.xaxis.set_minor_formatter(NullFormatter())
 
-    says = f"Slices of the modulus inside {tissue}, and of its standard deviation. {of.words}"
-    return draw_svg(draw, size=(2.0 * SIDE_INCHES + 0.6, 3.0 * SIDE_INCHES + 1.2), name=name, says=says)
+    return draw
 
 
 def _slice(axes: Axes, plane: Plane, cut: MapSlice, values: NDArray[np.float32], scale: Scale) -> None:
@@ -119,6 +132,8 @@ def map_png(data: ReportData, of: TissueMap) -> bytes:
     mesh = data.mesh
     faces, tets = section_faces(replace(mesh, tets=mesh.tets[of.elements]), axis=0, position=float(of.position[0]))
     corners = mesh.nodes.astype(np.float64)[faces]
-    colours = np.repeat(map_scale(of, data.unit).colours(of.moduli[tets].astype(np.float64))[:, None], 3, axis=1)
+    shown = shown_stiffness(data)
+    moduli = shown.factor * of.moduli[tets].astype(np.float64)
+    colours = np.repeat(map_scale(of, shown).colours(moduli)[:, None], 3, axis=1)
     normals = np.repeat(face_normals(corners)[:, None], 3, axis=1)
     return render_png(Triangles(corners, colours, normals), BESIDE_FRONT, width=WIDTH, height=HEIGHT)

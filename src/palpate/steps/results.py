@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 from palpate import report
 from palpate.errors import ResourceError
@@ -24,6 +24,7 @@ from palpate.study.outputs import OutputFolder
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -79,12 +80,22 @@ class _Shown:
         table: pd.DataFrame = pandas.DataFrame(rows).astype(dict.fromkeys(numbers, float))
         return table
 
-    def plot(self) -> Figure:
-        """A figure of the moduli with their 95 % intervals on a logarithmic axis; open ends are arrows.
+    @overload
+    def plot(self, ax: None = None, *, unit: str | None = None) -> Figure: ...
 
-        A figure of its own, which no display is needed for: `figure.savefig("moduli.png")`.
+    @overload
+    def plot(self, ax: Axes, *, unit: str | None = None) -> Axes: ...
+
+    def plot(self, ax: Axes | None = None, *, unit: str | None = None) -> Figure | Axes:
+        """The moduli with their 95 % intervals on a logarithmic axis; open ends are arrows.
+
+        ax: axes of matplotlib to draw on, which are given back; None: a figure of its own, which a notebook shows and
+        `savefig("moduli.png")` writes without a display. unit: "kPa" or "ratio"; None: that of the report. Raises
+        `ConfigurationError` for a unit in which the result has no numbers.
         """
-        return report.moduli_figure(self.to_dict(), self.colours)
+        if ax is not None:
+            return report.moduli_axes(ax, self.to_dict(), self.colours, unit)
+        return report.moduli_figure(self.to_dict(), self.colours, unit)
 
     def __str__(self) -> str:
         """Each tissue's value, interval, verdict and why on a line; then the warnings, the most harmful one first."""

@@ -38,6 +38,10 @@ Palpate.load = async () => {
     later.both = later.both.map(volume);
     later.outlines = later.outlines.map(surface);
     later.scale = Palpate.scale(later.scale);
+    if (later.motion) {
+      const { values, step, scale, factor } = later.motion;
+      later.motion = { values: Float32Array.from(array(values), (steps) => step * steps), scale: Palpate.scale(scale), factor };
+    }
     later.model = later.model.map((m) => ({
       tissue: m.tissue, triangles: array(m.triangles), rest: points(m.rest), fitted: points(m.fitted),
       distanceRest: array(m.distanceRest), distanceFitted: array(m.distanceFitted),
@@ -52,6 +56,7 @@ Palpate.load = async () => {
     const m = facts.mesh;
     facts.mesh = {
       nodes: points(m.nodes), tets: array(m.tets), region: array(m.region), worst: array(m.worst),
+      modulus: array(m.modulus),
       strain: Float32Array.from(array(m.strain), (steps) => m.strainStep * steps), // per cent
     };
   }

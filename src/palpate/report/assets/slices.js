@@ -260,19 +260,34 @@ Palpate.Planes = class {
   }
 };
 
-// The organs' outlines over the image of one state or the other.
+// The organs' outlines over the image of one state or the other, and what the model found in colours between them.
 Palpate.Slices = class extends Palpate.Planes {
   constructor(facts, number, section) {
     super(facts, facts.later[number], section, facts.references[facts.later[number].reference].box);
     this.phase = "after";
     for (const input of section.querySelectorAll(".legend input")) input.addEventListener("change", () => this.draw());
-    for (const input of section.querySelectorAll(".modes input")) input.addEventListener("change", () => this.flicker());
+    for (const input of section.querySelectorAll(".modes .states input")) input.addEventListener("change", () => this.flicker());
+    for (const input of section.querySelectorAll(".modes .colours input")) input.addEventListener("change", () => this.colour());
+    if (!facts.mesh) for (const row of section.querySelectorAll(".modes .colours")) row.hidden = true; // too large a mesh to be cut here
     this.start();
+    this.colour();
   }
 
   volumes() { return [this.reference.background, this.later.background]; }
 
-  get mode() { return this.section.querySelector(".modes input:checked").value; }
+  get mode() { return this.section.querySelector(".modes .states input:checked").value; }
+
+  // What is coloured: "none", "stiffness" or "motion".
+  get coloured() {
+    const chosen = this.facts.mesh && this.section.querySelector(".modes .colours input:checked");
+    return chosen ? chosen.value : "none";
+  }
+
+  // The colours that were chosen, with their bar and their words.
+  colour() {
+    for (const part of this.section.querySelectorAll(".live [data-of]")) part.hidden = part.dataset.of !== this.coloured;
+    this.draw();
+  }
 
   shows(layer) { return this.section.querySelector(`.t-${layer}`).checked; }
 
@@ -291,6 +306,8 @@ Palpate.Slices = class extends Palpate.Planes {
     const shown = this.mode === "flicker" ? this.phase : this.mode;
     const image = shown === "after" ? this.later : this.reference, volume = image.background;
     if (volume) this.drawVolume(context, view, frame, volume, layers);
+    const by = this.coloured;
+    if (by !== "none") Palpate.drawField(context, view, frame, this, { by, moved: shown === "after" && Boolean(this.later.motion), box: this.box, layers });
     if (this.shows("after") && shown !== "before") {
       for (const s of this.later.surfaces) this.stroke(context, view, frame, s, layers, { lineWidth: 5.5, globalAlpha: 0.5 });
     }

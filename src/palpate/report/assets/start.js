@@ -3,6 +3,7 @@
 (async () => {
   Palpate.theme();
   Palpate.copies();
+  if (Palpate.saves) Palpate.saves();
   const facts = await Palpate.load();
   const soon = (section, start) => {
     const observer = new IntersectionObserver((entries) => {
