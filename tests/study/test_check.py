@@ -45,7 +45,7 @@ def test_every_problem_is_listed_and_the_first_is_what_an_estimate_ends_with(tmp
     assert [sum(word in problem.message for problem in found.problems) for word in words] == [1] * 6
     assert found.exit_code == 2
     assert "nothing moves this body" in found.problems[0].message
-    assert found.text().splitlines()[-1].startswith("warning (units): tissue 'rest'")
+    assert found.text().splitlines()[-2].startswith("warning (units): tissue 'rest'")
 
 
 def test_a_case_that_cannot_be_read_is_a_problem_with_its_code(tmp_path, capsys):

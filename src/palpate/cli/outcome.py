@@ -9,6 +9,7 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 from palpate.cli.console import log_is_open
+from palpate.findings import HELP
 from palpate.images.named_labels import printable
 
 if TYPE_CHECKING:
@@ -92,8 +93,9 @@ def columns(rows: Sequence[Sequence[str]]) -> str:
 
 
 def warning_lines(document: Mapping[str, Any]) -> str:
-    """The document's warnings, a line each with its code; docs/warnings.md tells of all codes."""
-    return "".join(f"warning ({warning['code']}): {warning['message']}\n" for warning in document["warnings"])
+    """The document's warnings, one line each with its code, then where the codes are explained."""
+    lines = [f"warning ({warning['code']}): {warning['message']}" for warning in document["warnings"]]
+    return "".join(f"{line}\n" for line in [*lines, f"each code is explained on {HELP}"]) if lines else ""
 
 
 def printable_lines(text: str) -> str:

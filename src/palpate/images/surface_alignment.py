@@ -128,8 +128,8 @@ def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
         middles.append((first.area @ first.places / first.area.sum(), second.area @ second.places / second.area.sum()))
     if not surfaces:
         raise InputDataError(
-            "no tissue shows enough of its surface in both images, away from their borders, for a motion between them"
-            " to be measured; enlarge the images, or set align = 'none'"
+            "no tissue shows enough of its surface in both images, away from their borders, to measure the motion"
+            " between them; use larger fields of view, or set align = 'none'"
         )
     centre = np.average([here for here, _ in middles], axis=0)
     shift = np.median([there - here for here, there in middles], axis=0)
@@ -139,8 +139,8 @@ def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
     found = [_descended(surfaces, centre, start) for start in starts if start.n_seen >= LEAST_POINTS]
     if not found:
         raise InputDataError(
-            f"under {LEAST_POINTS} surface points come to lie inside the later image: the images show different parts"
-            " of the body"
+            f"fewer than {LEAST_POINTS} surface points lie inside the later image, so the images show different parts"
+            " of the body; check both"
         )
     best = min(found, key=lambda trial: trial.misfit)
     if 2 * still.n_seen > best.n_seen:

@@ -35,7 +35,7 @@ KNOWN_FACTOR = 1.2
 VOXELS = (-0.5, -0.25, 0.25, 0.5)
 PRIOR_WIDTHS = (0.5, 2.0)
 ALL = "all tissues"
-DRAWN = "not moved, as how it is drawn is an unknown of the estimate: the interval holds it"
+DRAWN = "not varied: how it is drawn is an unknown of the estimate, so the interval includes it"
 
 
 @dataclass(frozen=True, slots=True)

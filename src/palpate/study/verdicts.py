@@ -17,7 +17,7 @@ from palpate.uncertainty import NORMAL_95, Covariance, Interval, ModulusInterval
 from palpate.unknowns import KNOWN_MODULUS, ratio_of_eta
 
 IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
-NOT_FOLLOWED = "the 95 % interval is open: it could not be followed from a minimum"
+NOT_FOLLOWED = "the 95 % interval is open: it could not be computed from a minimum"
 
 
 def hull(intervals: Sequence[Interval]) -> Interval:
@@ -36,7 +36,7 @@ def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str,
     """
     low, high = interval
     if at_bound:
-        return NOT_IDENTIFIED, "the estimate lies at its bound; the images do not hold it back"
+        return NOT_IDENTIFIED, "the estimate lies at its bound; the data do not limit it"
     if low is None or high is None:
         return NOT_IDENTIFIED, "the 95 % interval is open: it reaches beyond the bounds of the search"
     width = high / low
@@ -132,11 +132,11 @@ def estimates_of(
             # the ratio may say more than a modulus whose scale is known within a range alone
             ratio_word, ratio_why = verdict(by_ratio, at_bound=of.at_bound, absolute=True)
             if ratio_word not in (NOT_IDENTIFIED, word):
-                left = "the range of the known modulus leaves more of it open in kPa"
+                left = "the range of the known modulus makes the interval in kPa wider"
                 word, why = "ratio only", f"of the ratio {ratio_why}; {left}"
         if inversion.unsettled and word != NOT_IDENTIFIED:
             word = "weak" if word == "identified" else word
-            why = f"{why}, but does not hold what layers round the organs would do (warning `unsettled`)"
+            why = f"{why}, but leaves out the effect of layers around organs (warning `unsettled`)"
         points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)
         inside = log_interval(value, float(np.sqrt(given[i])), lower=low or 0.0, upper=high or np.inf)
         within = (inside[0] or low, inside[1] or high)

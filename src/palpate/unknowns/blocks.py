@@ -44,7 +44,7 @@ LAYER_ODDS = -1.9  # log prior odds that layers differ from their tissue, as sel
 class Acts(Enum):
     """What the unknowns of a block enter."""
 
-    BOUNDARY = "the displacement of what is prescribed"
+    BOUNDARY = "the displacement of prescribed points"
     MATERIAL = "the material of the elements"
     MODULI = "the logarithms of the moduli of regions"
     RESIDUALS = "the residuals of the observations, one unknown each"

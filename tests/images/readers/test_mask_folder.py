@@ -78,7 +78,7 @@ def test_a_contested_voxel_goes_to_the_smaller_organ_and_is_counted(tmp_path: Pa
     assert {name[2:]: n for name, n in by_name(image).items()} == {"tumour": 20, "gland": 60, "body": 40}
     (finding,) = image.findings
     assert finding.code == "overlap"
-    assert finding.message.startswith("20 voxels are claimed by several organs")
+    assert finding.message.startswith("20 voxels belong to several masks")
     assert "body" not in finding.message
 
 
