@@ -160,7 +160,7 @@ def make_estimation(displacement: np.ndarray) -> Estimation:
     fit = TissueFit("prostate", Fit(0.6, 0.8, 1.6, 0.91), Fit(0.08, 0.11, 0.22, 0.984), 0.93)
     return Estimation(
         status="converged",
-        reason="the decrement fell under its tolerance",
+        reason="the predicted decrease of the objective fell below its tolerance",
         estimates=(make_estimate("prostate", 58.9, 60.0), make_estimate("bladder", 31.2)),
         covariance=Covariance(np.array([[0.01, -0.003], [-0.003, 0.06]]), *np.zeros((3, 2, 2))),
         starts=tuple(make_start(ratio) for ratio in (0.5, 2.0, 8.0)),

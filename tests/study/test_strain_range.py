@@ -33,7 +33,7 @@ def test_large_strains_under_the_linear_law_are_warned_of(space):
     assert remark.code == "linear-strains"
     for words in ("In 'late.nii' 100.0 %", "99th percentile 22 %", 'law = "neo-hookean"'):  # (1.2^2 - 1) / 2 = 0.22
         assert words in remark.message
-    assert "free of stress (the emptier one) as images.before" in remark.message
+    assert "free of stress, the emptier one, as 'before'" in remark.message
 
 
 def test_small_strains_pass(space):

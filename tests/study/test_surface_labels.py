@@ -96,7 +96,7 @@ def test_what_is_no_closed_surface_is_refused(tmp_path):
         "none": (tmp_path / "none.stl", "cannot be read"),
         "cut": (stl(tmp_path / "cut.stl", whole), "is no STL"),
         "text": (stl(tmp_path / "text.stl", whole, text=True), "damaged text"),
-        "nan": (stl(tmp_path / "nan.stl", np.where(whole == 10.0, np.nan, whole)), "no number of millimetres"),
+        "nan": (stl(tmp_path / "nan.stl", np.where(whole == 10.0, np.nan, whole)), "too large for millimetres"),
         "empty": (stl(tmp_path / "empty.stl", whole[:0]), "is not closed"),
         "turned": (stl(tmp_path / "turned.stl", turned), "beside 9 of 18 edges of .* face opposite ways"),
     }
@@ -113,7 +113,7 @@ def test_what_is_no_closed_surface_is_refused(tmp_path):
         (1e-3, 0.0, "1000 times as large it would be 27 mL: where the file is in metres, write --scale 1000"),
         (0.1, 0.0, "10 times as large it would be 27 mL: where the file is in centimetres, write --scale 10"),
         (0.05, 0.0, "has 0 voxels: it holds 0.00337 mL"),
-        (1.0, 300.0, "has 0 voxels: .* are its unit and its axes right"),
+        (1.0, 300.0, "has 0 voxels: .* check its unit and its axes"),
     ],
 )
 def test_an_organ_without_voxels_is_refused_with_what_to_write(tmp_path, factor, shift, words):

@@ -104,7 +104,7 @@ def _counts(fields: Mapping[str, str], name: str, path: Path, default: str = "mi
     words = fields.get(name, default).split()
     sizes = [int(word) for word in words if word.isascii() and word.isdigit() and len(word) <= 20]
     if len(sizes) != len(words) or not sizes or min(sizes) < 1:
-        raise refused(path, name, " ".join(words), "positive whole numbers are needed; export the image again")
+        raise refused(path, name, " ".join(words), "positive counts are needed; export the image again")
     return sizes
 
 

@@ -91,7 +91,7 @@ def _fields(lines: list[str], path: Path) -> dict[str, Any]:
         if name not in fields:
             raise refused(path, name, "missing", "export the image again")
     if min(fields["sizes"], default=0) < 1 or len(fields["sizes"]) != fields["dimension"]:
-        raise refused(path, "sizes", fields["sizes"], f"{fields['dimension']} positive sizes are needed; export again")
+        raise refused(path, "sizes", fields["sizes"], f"{fields['dimension']} positive counts are needed; export again")
     return fields
 
 

@@ -143,7 +143,7 @@ def check_size(shape: tuple[int, ...], path: Path, *, needed: int = 0, available
         flaw = f"states {sizes} voxels, more than the {MAX_VOXELS} that are read"
         raise InputDataError(f"the header of '{path}' {flaw}; crop the image to the organs, or repair the header")
     if needed > available:
-        flaw = f"states {needed} bytes ({sizes} voxels), more than the file holds"
+        flaw = f"states {needed} bytes ({sizes} voxels), which the file cannot hold"
         raise InputDataError(f"the header of '{path}' {flaw}; it is cut short or damaged: export or copy it again")
 
 
