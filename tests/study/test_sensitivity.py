@@ -192,7 +192,7 @@ def test_every_assumption_is_varied_by_the_method_that_serves(document):
 
 
 def test_a_surface_whose_drawing_is_an_unknown_is_not_moved_beside_it(case_file):
-    """No step from an estimate with its offset free says what another offset would be found: the interval includes it."""
+    """No step from an estimate with its offset free says what another offset would be found: the interval holds it."""
     case = read_case(case_file)
     case = replace(case, discrepancy=replace(case.discrepancy, surface_offset_mm=1.0))
     body = make_body(read_states(case, progress=silent), case, progress=silent)

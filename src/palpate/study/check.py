@@ -48,6 +48,7 @@ from palpate.study.refusals import refuse_lost, refuse_unmeshable
 from palpate.study.samples import require_samples
 
 T = TypeVar("T")
+IMAGE = re.compile(r"'(before|after(\[\d+\])?)'")
 NUMBER = re.compile(r"[-+]?\d[\d.,]*")
 
 
@@ -55,7 +56,7 @@ NUMBER = re.compile(r"[-+]?\d[\d.,]*")
 class Problem:
     """Something that an estimate would refuse (`exit_code` > 0) or warn of (0).
 
-    place: the image in which a refusal was found ("'after[2]'"), if it is one image's.
+    place: the image in which a refusal was found ("'after[2]' of pair 2"), if it is about one image.
     """
 
     code: str
@@ -65,8 +66,8 @@ class Problem:
 
     @property
     def cause(self) -> tuple[str, str]:
-        """What refusals with one cause have in common: the code, and the message without its image and its numbers."""
-        return self.code, NUMBER.sub("#", self.message.replace(self.place, "")) if self.place else self.message
+        """What refusals with one cause have in common: the code, and the message without images and numbers."""
+        return self.code, NUMBER.sub("", IMAGE.sub("", self.message)) if self.place else self.message
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,12 +185,12 @@ class _Problems:
         self.found: list[Problem] = []
         self._findings: list[Finding] = []
 
-    def attempt(self, make: Callable[[], T], *, image: str = "") -> T | None:
-        """What `make` returns; None, and a problem, when it is refused; image: the name of the one that it looks at."""
+    def attempt(self, make: Callable[[], T], *, place: str = "") -> T | None:
+        """What `make` returns; None, and a problem at that place, when it is refused."""
         try:
             return make()
         except PalpateError as error:
-            self.add(Problem(type(error).__name__, str(error), error.exit_code, image and f"'{image}'"))
+            self.add(Problem(type(error).__name__, str(error), error.exit_code, place))
         except MemoryError:
             text = "these images need more memory than is free; crop them to the organs"
             self.add(Problem("ResourceError", text, ResourceError.exit_code))
@@ -201,9 +202,12 @@ class _Problems:
         return any(problem.exit_code for problem in self.found)
 
     def add(self, problem: Problem) -> None:
-        """Keep a problem once."""
-        if problem not in self.found:
-            self.found.append(problem)
+        """Keep a problem once; a refusal that was found before its image was looked at gets its place."""
+        for number, known in enumerate(self.found):
+            if known in (problem, replace(problem, place="")):
+                self.found[number] = problem
+                return
+        self.found.append(problem)
 
     def warn(self, findings: Sequence[Finding], pair: int = 1) -> None:
         """Keep findings on the images of a pair."""
@@ -367,11 +371,12 @@ def _checked_pair(
     problems.attempt(partial(refuse_unmeshable, before, "before"))
     for name, image in zip(later_names(len(after)), after, strict=True):
         problems.warn(check_segmentation(image, name), number)
-        problems.attempt(partial(refuse_unmeshable, image, name), image=name)
+        place = f"'{name}'" + (f" of pair {number}" if number > 1 else "")
+        problems.attempt(partial(refuse_unmeshable, image, name), place=place)
         if in_place:
-            problems.attempt(partial(refuse_lost, before, image, name), image=name)
+            problems.attempt(partial(refuse_lost, before, image, name), place=place)
         if any(tissue.role in OBSERVED for tissue in before.tissues):
-            findings = problems.attempt(partial(check_pair, before, image, name=name), image=name)
+            findings = problems.attempt(partial(check_pair, before, image, name=name), place=place)
             problems.warn(findings or (), number)
     problems.warn(every_finding(before, after, loaded=bool(case.loads)), number)
     return replace(states, before=before, after=after)
