@@ -106,7 +106,7 @@ def test_nifti_is_read_as_its_header_says(tmp_path, what, axes):
     ("what", "axes", "words"),
     [
         ({"vectors": MOVED, "four": True}, "", 'axes = "RAS"'),
-        ({"vectors": MOVED, "intent_code": 1006}, "LPS", "in RAS, as it says"),
+        ({"vectors": MOVED, "intent_code": 1006}, "LPS", "in RAS, by its header"),
         ({"vectors": MOVED, "intent_code": 1007, "intent_name": "NREG_TRANS", "intent_p1": 2.0}, "", "reg_transform"),
         ({"vectors": MOVED, "intent_code": 1007, "intent_name": "NREG_TRANS", "intent_p1": 4.0}, "", "reg_transform"),
         ({"vectors": MOVED, "intent_code": 2006}, "RAS", "warp of FSL"),

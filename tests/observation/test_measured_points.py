@@ -265,7 +265,7 @@ def test_a_table_that_is_none_is_refused(tmp_path, text, words):
 @pytest.mark.parametrize("n", [1, 3])
 def test_a_field_of_a_row_or_two_is_no_field_but_a_marker_is_one(tmp_path, points, n):
     path = csv_of(tmp_path / "m.csv", points[:n], moved(points[:n]))
-    with pytest.raises(InputDataError, match=f"holds {n} of the 4 points or more"):
+    with pytest.raises(InputDataError, match=f"holds {n} points, and a field needs at least 4"):
         read(path, kind="displacement-field")
     assert f"{n} pair{'s' * (n > 1)} of points" in read(path).in_words
 

@@ -1,4 +1,4 @@
-"""Where the body ends in a CT: what of an image is air around it, or the table that it lies on."""
+"""The outside of the body in a CT: the air around it, and the table that it lies on."""
 
 from __future__ import annotations
 

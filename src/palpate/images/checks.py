@@ -274,7 +274,7 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
 
     The agreement is the mean over the organs of the share of voxels that find their own organ; the organs' common
     centroids are laid on each other, so neither a shift nor the size of the field of view matters. Where exchanging the
-    labels of two organs makes them agree much better, and by as much as a mirror does, that is told instead.
+    labels of two organs makes them agree much better, and by as much as a mirror does, that is refused instead.
     """
     points = []  # of each organ at most MIRROR_SAMPLES voxel centres (n, 3), evenly picked, RAS mm
     for i in observed:
@@ -320,7 +320,7 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
 def _shifts(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:
     """Organs that move by more than half of their size, and drivers by all of it.
 
-    Measured against the rigid tissues where there are any; what an alignment has taken out is not in it.
+    Measured relative to the rigid tissues, if there are any; a motion that the alignment removed does not count.
     """
     shift = {i: after.middle(i) - before.middle(i) for i in observed}
     rigid = [shift[i] for i in observed if before.tissues[i].role is Role.RIGID]

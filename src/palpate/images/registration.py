@@ -1,4 +1,4 @@
-"""How a later image lay when it was read: the rigid motion that was measured, and taken out of it."""
+"""The rigid motion of a later image that was measured and removed."""
 
 from __future__ import annotations
 
@@ -83,12 +83,12 @@ class Registration:
 
 
 def length_text(mm: float) -> str:
-    """A length as a person wants it: two digits, and nothing below a hundredth of a millimetre."""
+    """A length with two digits, and nothing below 0.01 mm."""
     return f"{mm:.2g}" if mm >= LEAST_MM else f"less than {LEAST_MM:g}"
 
 
 def registration(before: Segmentation, maps: SurfaceMaps, fit: RigidFit, *, by: str) -> Registration:
-    """What a measured motion does to the organs, and what it leaves of each surface.
+    """A measured motion of the organs, and the distance that remains at each surface.
 
     maps: as of `surface_maps`; by: "rigid-tissues" or "surfaces", on which it was measured.
     """

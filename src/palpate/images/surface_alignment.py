@@ -1,4 +1,4 @@
-"""Rigid motion between two images without bones: of all surfaces that both show, most of which nearly keep together."""
+"""Rigid motion between two images without bones, from all surfaces that both show."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def surface_maps(before: Segmentation, after: Segmentation) -> SurfaceMaps:
 
 
 def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
-    """The rigid motion before -> after that most surfaces agree on; none where that explains the images about as well.
+    """The rigid motion before -> after that most surfaces agree on, unless no motion explains the images as well.
 
     Most probable motion under r_i = phi_after(R x_i + t) - phi_before(x_i) ~ N(0, K) of points x_i of every tissue's
     surface: K is that of a smooth motion of the tissue's own, alike over 40 mm, of 1.5 mm (a driver: 4 mm), and 1 mm

@@ -22,7 +22,9 @@ from palpate.inversion.trust_region import (
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
 from palpate.progress import Progress
 
-RELEASED = replace(NEAR, all_material=False)  # whether images tell of what was fixed hangs on what decides alone
+RELEASED = replace(
+    NEAR, all_material=False
+)  # whether the data determine what was fixed depends only on the terms that decide
 EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
 
 

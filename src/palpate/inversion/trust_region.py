@@ -306,7 +306,7 @@ def _iteration(
 def _chosen_afresh(now: OuterIterate) -> OuterIterate:
     """With the blocks' alternatives as they are chosen where an iteration has ended, all blocks having their choice.
 
-    On the way an alternative stays until another one is more than as good, so that it hangs on where that began.
+    On the way an alternative stays until another one is more than as good, so that it depends on where that began.
     """
     at, begin = now.minimum, replace(now.objective, learn_last=True, chosen=())
     learned = with_hyper_parameters(begin, at.evaluation, at.unknowns)

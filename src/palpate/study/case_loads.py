@@ -17,7 +17,7 @@ from palpate.study.case_data import CaseLoad
 
 
 def case_loads(case: Case, space: LagrangeSpace, state: int, *, share: float = 1.0) -> tuple[Load, ...]:
-    """What `case` adds in the later state with a number, from 1, to the loads of the reference, or a `share` of it.
+    """The loads that `case` adds in a later state, numbered from 1, to those of the reference, or a `share` of them.
 
     Those of the reference itself for the number 0.
 

@@ -96,7 +96,7 @@ class FittedMaterial:
 
 
 def fitted_materials(inversion: Inversion) -> tuple[FittedMaterial, ...]:
-    """The material of the best minimum, one a later state."""
+    """The material of the best minimum, one for each later state."""
     parameters, found = inversion.objective.parameters, list[FittedMaterial]()
     unknowns = inversion.minimum.unknowns
     coefficients, blocks = parameters.coefficients(unknowns), enumerate(parameters.blocks)

@@ -50,7 +50,7 @@ class Misfit:
 def misfits_of(
     lines: Sequence[Linearisation], points: Sequence[PointFit], tissues: Sequence[Tissue]
 ) -> tuple[Misfit, ...]:
-    """Those of all data of a fit; points: measured and fitted motions, in the order of `lines`.
+    """The misfits of all data of a fit; points: measured and fitted motions, in the order of `lines`.
 
     Of the surfaces those of `tissues` that are meshed: the modes of a driver follow its wall, and a hollow tissue is
     seen where no mesh is beside it, too, so that parts of it in the image belong to nothing.

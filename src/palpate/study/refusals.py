@@ -1,4 +1,4 @@
-"""What no estimate can begin with (nothing that moves, organs too small, thin or lost), and where its law ends."""
+"""Cases that no estimate can start from (no motion; organs too small, thin or lost); the range of the linear law."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ MOVES_MM = 1e-6  # less is rounding
 
 
 def refuse_what_cannot_be_estimated(case: Case) -> None:
-    """Say before any image is read what no image mends: `ConfigurationError`.
+    """Raise `ConfigurationError`, before any image is read, for a case that no image can make right.
 
-    There is no later state, nothing can move, or a load or force acts on a surface that the case has not.
+    There is no later state, nothing can move, or a load or force acts on a surface that does not exist.
     """
     if case.images is not None and not case.images.after:
         raise ConfigurationError(

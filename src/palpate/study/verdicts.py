@@ -100,9 +100,9 @@ def estimates_of(
     *,
     truth: Mapping[str, float],
 ) -> tuple[ModulusEstimate, ...]:
-    """What is stated of the moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known.
+    """The estimates of moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known.
 
-    Where the covariance lacks what layers round organs would do, as the inversion is `unsettled`, nothing is
+    Where the inversion is `unsettled`, the covariance lacks the effect of layers around organs, and nothing is
     `identified`.
     """
     mapping, scale = inversion.objective.parameters, inversion.objective.parameters.scale_kpa
@@ -129,7 +129,7 @@ def estimates_of(
         word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
         why = why if of.followed or of.at_bound else NOT_FOLLOWED
         if word != "identified" and of_scale > 0.0:
-            # the ratio may say more than a modulus whose scale is known within a range alone
+            # the ratio may be narrower than a modulus whose scale is only known as a range
             ratio_word, ratio_why = verdict(by_ratio, at_bound=of.at_bound, absolute=True)
             if ratio_word not in (NOT_IDENTIFIED, word):
                 left = "the range of the known modulus makes the interval in kPa wider"

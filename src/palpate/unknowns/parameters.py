@@ -1,4 +1,4 @@
-"""From the unknowns to what a model takes of them, and what is believed of them before the images are seen."""
+"""The map from the unknowns to the parameters of a model, and the prior of the unknowns."""
 
 from __future__ import annotations
 
