@@ -92,7 +92,7 @@ def test_what_is_no_closed_surface_is_refused(tmp_path):
     whole = box([0.0] * 3, [10.0] * 3)
     turned = np.concatenate([whole[:5, ::-1], whole[5:]])
     wrong = {
-        "open": (stl(tmp_path / "open.stl", whole[1:]), "is not closed .11 triangles, 3 edges"),
+        "open": (stl(tmp_path / "open.stl", whole[1:]), "is not closed .3 edges of its 11 triangles"),
         "none": (tmp_path / "none.stl", "cannot be read"),
         "cut": (stl(tmp_path / "cut.stl", whole), "is no STL"),
         "text": (stl(tmp_path / "text.stl", whole, text=True), "damaged text"),
@@ -184,7 +184,7 @@ def test_a_text_too_large_to_be_taken_apart_is_refused_before_it_is(tmp_path):
 def test_names_that_stand_twice_and_grids_beyond_all_are_refused(tmp_path):
     (tmp_path / "other").mkdir()
     twice = [stl(folder / "organ.stl", box([0.0] * 3, [10.0] * 3)) for folder in (tmp_path, tmp_path / "other")]
-    with pytest.raises(ConfigurationError, match="2 surfaces are named, of 1 names"):
+    with pytest.raises(ConfigurationError, match="2 surfaces are given, with 1 different names"):
         surface_labels(twice)
     with pytest.raises(ResourceError, match="voxels"):
         surface_labels(twice[:1], spacing_mm=0.01)

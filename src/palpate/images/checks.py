@@ -131,7 +131,7 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
                 share = f"{touching / (touching + sum(_faces(mask))):.1%}"
                 text = (
                     f"'{tissue.name}' reaches the border of '{name}': {share} of its surface is only the cut of the"
-                    " image and says nothing about its stiffness. Use a larger field of view, if there is one."
+                    " image, where its motion is unknown. Use a larger field of view, if there is one."
                 )
                 findings.append(Finding("cut-by-border", text, tissue.name, f"in '{name}' ({share})"))
             findings += _too_thin(segmentation.index == i, box, tissue, name)

@@ -70,7 +70,7 @@ def _fields(lines: list[str], path: Path) -> dict[str, str]:
             continue
         first, second = fields.setdefault(name, value[0]).split(), value[0].split()
         if first != second and not (numbers_in(first) and numbers_in(first) == numbers_in(second)):
-            raise refused(path, name, fields[name], "it occurs again with another value; delete the wrong one")
+            raise refused(path, name, fields[name], "it is there twice, with different values; delete the wrong one")
     if LAST not in fields:
         raise InputDataError(f"'{path}' does not begin as a MetaImage file does; export it as MetaImage or NIfTI")
     return fields

@@ -128,7 +128,7 @@ def _place(fields: Mapping[str, Any], path: Path) -> tuple[NDArray[np.float64], 
     vectors, origin = fields["space directions"], fields.get("space origin", np.zeros(n))
     if vectors.shape != (fields["dimension"], n) or origin.shape != (n,):
         raise refused(
-            path, "space directions", vectors.tolist(), f"each axis needs a vector of {n} numbers; export it again"
+            path, "space directions", vectors.tolist(), f"vectors of {n} numbers are needed, one for each axis"
         )
     beside = np.isnan(vectors).all(axis=1) | (timed & ~vectors[:, :3].any(axis=1))
     if np.count_nonzero(~beside) != 3 or vectors[~beside, 3:].any():
