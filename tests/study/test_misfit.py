@@ -238,7 +238,7 @@ def test_a_surface_that_is_drawn_otherwise_is_named_whole_or_in_part(smooth_nois
     assert f"misses the surface of 'organ' in state 1 by {rms:.2g} mm" in whole.text
     assert f"{whole.times:.2g} times what the estimated noise of 0.3 mm explains" in whole.text
     (part,) = misfits_of_surface(0.3 * values + 1.0 * cap)
-    assert "by 0.34 mm (root mean square) and 5% of it by 0.93 mm" in part.text
+    assert "by 0.34 mm (root mean square; 95th percentile 0.93 mm)" in part.text
     assert part.times > 1.5
 
 

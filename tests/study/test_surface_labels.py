@@ -94,7 +94,7 @@ def test_what_is_no_closed_surface_is_refused(tmp_path):
     wrong = {
         "open": (stl(tmp_path / "open.stl", whole[1:]), "is not closed .3 edges of its 11 triangles"),
         "none": (tmp_path / "none.stl", "cannot be read"),
-        "cut": (stl(tmp_path / "cut.stl", whole), "is no STL"),
+        "cut": (stl(tmp_path / "cut.stl", whole), "is not an STL"),
         "text": (stl(tmp_path / "text.stl", whole, text=True), "damaged text"),
         "nan": (stl(tmp_path / "nan.stl", np.where(whole == 10.0, np.nan, whole)), "too large for millimetres"),
         "empty": (stl(tmp_path / "empty.stl", whole[:0]), "is not closed"),
