@@ -109,20 +109,23 @@ def one_a_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         key = (finding.code, finding.about) if finding.place else (finding.code, finding.about, finding.message)
         causes.setdefault(key, []).append(finding)
     ranked = sorted(causes.values(), key=lambda same: rank(same[0].code))
-    return tuple(replace(first, message=with_places(first, others)) for first, *others in ranked)
+    found = []
+    for first, *others in ranked:
+        places = dict.fromkeys(other.place for other in others if other.place not in ("", first.place))
+        found.append(replace(first, message=with_places(first.message, [*places])))
+    return tuple(found)
 
 
-def with_places(first: Finding, others: Iterable[Finding]) -> str:
-    """The message of the first finding; its first sentence names as many other places as 60 words allow."""
-    places = [place for place in dict.fromkeys(other.place for other in others) if place not in ("", first.place)]
-    end = SENTENCE_END.search(first.message)
-    cut = end.start() if end else len(first.message.removesuffix("."))
+def with_places(message: str, places: Sequence[str]) -> str:
+    """The message with other places in its first sentence, as many of them by name as 60 words allow."""
+    end = SENTENCE_END.search(message)
+    cut = end.start() if end else len(message.removesuffix("."))
     for named in range(len(places), 0, -1):
-        text = f"{first.message[:cut]}; also {some(places, most=named)}{first.message[cut:]}"
+        text = f"{message[:cut]}; also {some(places, most=named)}{message[cut:]}"
         if words_in(text) <= MOST_WORDS:
             return text
     more = f"; also in {len(places)} more place{'s' * (len(places) > 1)}" if places else ""
-    return f"{first.message[:cut]}{more}{first.message[cut:]}"
+    return f"{message[:cut]}{more}{message[cut:]}"
 
 
 def listing(lead: str, items: Sequence[str], rest: str) -> str:

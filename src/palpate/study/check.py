@@ -220,7 +220,10 @@ class _Problems:
         causes: dict[tuple[str, str], list[Problem]] = {}
         for refusal in (p for p in self.found if p.exit_code):
             causes.setdefault(refusal.cause, []).append(refusal)
-        refused = [replace(first, message=with_places(first, others)) for first, *others in causes.values()]
+        refused = [
+            replace(first, message=with_places(first.message, [*dict.fromkeys(other.place for other in others)]))
+            for first, *others in causes.values()
+        ]
         return (*refused, *sorted(warned, key=lambda problem: rank(problem.code)))
 
 
