@@ -346,8 +346,8 @@ PRESSURE = '[[loads]]\nkind = "pressure"\npressure_kpa = 1.0\nsurface = '
         (('boundary = "prescribed"', 'boundary = "glued"'), ConfigurationError, "did you mean"),
         (("[mechanics]", PRESSURE + '"walls"\n[mechanics]'), ConfigurationError, "boundary free if"),
         (("[mechanics]", PRESSURE + '"grip"\n[mechanics]'), ConfigurationError, "the boundary free"),
-        (("[mechanics]", "[driver]\nkernel_mm = 0.5\n[mechanics]"), InputDataError, "further than 0.5 mm"),
-        (('where = "z_min"', 'where = "boundary"'), GeometryError, "named before it"),
+        (("[mechanics]", "[driver]\nkernel_mm = 0.5\n[mechanics]"), InputDataError, "more than 0.5 mm"),
+        (('where = "z_min"', 'where = "boundary"'), GeometryError, "names before it"),
         (
             (f"state = 1\nforce_n = {FORCE_N}", f"state = 2\nforce_n = {FORCE_N}"),
             ConfigurationError,
@@ -497,7 +497,7 @@ def test_volumes_are_those_of_the_elements(grouped):
         (
             ("label = 2", 'label = "STIFF"\nrole = "estimate"\n[tissues.rest]\nlabel = "remaining"'),
             ConfigurationError,
-            "'rest' has no tetrahedron: the others have all",
+            "'rest' has no tetrahedron, because the other tissues have all",
         ),
         (
             ('[tissues.high]\nlabel = 2\nrole = "estimate"\n', ""),
@@ -507,7 +507,7 @@ def test_volumes_are_those_of_the_elements(grouped):
         (
             ('name = "hand"\nwhere = "GRIP"', 'name = "hand"\nwhere = "INNER"'),
             GeometryError,
-            r"the group 'INNER' has triangles that are no faces of the mesh's boundary, beside \d+ that are",
+            r"the group 'INNER' has triangles that are not faces of the mesh's boundary, beside \d+ that are",
         ),
         (('where = "GRIP"', 'where = "TOP"\nboundary = "free"'), GeometryError, "all faces of the surface 'plate'"),
         (('where = "TOP"\nboundary = "free"', 'where = "BOTH"'), ConfigurationError, "no surface 'BOTH'"),
@@ -527,11 +527,11 @@ def test_groups_that_do_not_fit_the_body_are_refused_by_name(grouped, change, er
 @pytest.mark.parametrize(
     ("plate", "hand", "words"),
     [
-        ("TOP", "GRIP", "all faces of the surface 'hand' belong to surfaces that are named before"),
+        ("TOP", "GRIP", "all faces of the surface 'hand' belong to surfaces that the case names before"),
         (
             "GRIP",
             "TOP",
-            "4 of the 8 faces of the surface 'hand' would be free, as they belong to 'plate'",
+            "4 of the 8 faces of the surface 'hand' would stay free, because they belong to 'plate'",
         ),
     ],
 )
@@ -556,7 +556,7 @@ def test_a_mesh_in_metres_is_named_with_the_factor(grouped):
     text = GROUPS.replace('where = "GRIP"', 'where = "z_min"')
     small = replace(of, nodes=1e-3 * of.nodes)
     with pytest.raises(
-        InputDataError, match=r"0\.03 mm long; if it was written in metres, multiply its coordinates by 1000"
+        InputDataError, match=r"0\.03 mm long. If it was written in metres, multiply its coordinates by 1000"
     ):
         read_states(grouped(text, small))
     assert [f.code for f in read_states(grouped(GROUPS, small)).findings] == ["units"]
@@ -578,7 +578,10 @@ def test_pieces_that_share_no_face_are_named(grouped):
     (finding,) = (
         problem for problem in check_case(case, [], progress=lambda _: None).problems if problem.code == "islands"
     )
-    assert "2 pieces that share no face, the largest of 72 tetrahedra, the smallest of 1 around" in finding.message
+    assert (
+        "2 pieces that share no face, so no stress passes between them; the smallest has 1 tetrahedra near"
+        in finding.message
+    )
 
 
 def test_cell_data_of_another_name_is_told(grouped):
