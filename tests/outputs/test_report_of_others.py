@@ -108,7 +108,7 @@ def test_a_result_whose_numbers_were_edited_is_refused(copy, capsys):
     document = json.loads((copy / "result.json").read_text())
     document["estimates"][0]["value"] = 12.3
     (copy / "result.json").write_text(json.dumps(document))
-    assert "one of them was changed" in refused(copy, capsys)
+    assert "one was changed since" in refused(copy, capsys)
 
 
 def test_a_display_of_matplotlib_that_is_not_there_harms_no_page(copy):

@@ -148,7 +148,7 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
     if estimation.status != "converged":
         raise EstimationError(
             f"the estimate ended with the status '{estimation.status}' ({estimation.reason}), so there is no model to"
-            " export; only converged estimates can be exported"
+            " export; an estimate that did not converge cannot be exported"
         )
     pairs: list[tuple[CaseResult | PairResult, tuple[NDArray[np.float64], ...]]] = []
     pairs += [(result, result.displacements)]
