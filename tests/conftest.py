@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import PalpateError
-from palpate.findings import Finding
+from palpate.findings import MOST_WORDS, SENTENCE_END, Finding, words_in
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import read
 from palpate.images.segmentation import segment
@@ -160,7 +160,7 @@ def make_estimation(displacement: np.ndarray) -> Estimation:
     fit = TissueFit("prostate", Fit(0.6, 0.8, 1.6, 0.91), Fit(0.08, 0.11, 0.22, 0.984), 0.93)
     return Estimation(
         status="converged",
-        reason="the decrement fell under its tolerance",
+        reason="the predicted decrease of the objective fell below its tolerance",
         estimates=(make_estimate("prostate", 58.9, 60.0), make_estimate("bladder", 31.2)),
         covariance=Covariance(np.array([[0.01, -0.003], [-0.003, 0.06]]), *np.zeros((3, 2, 2))),
         starts=tuple(make_start(ratio) for ratio in (0.5, 2.0, 8.0)),
@@ -256,6 +256,33 @@ def coarse_pictures():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(render, "FINE", 1)
         yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def warnings_made():
+    """Messages of all warnings that the program makes in this process, from any test."""
+    made, plain = list[str](), Finding.__init__
+
+    def kept(self, *args, **named):
+        plain(self, *args, **named)
+        made.append(self.message)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Finding, "__init__", kept)
+        yield made
+
+
+@pytest.fixture(autouse=True)
+def every_warning_is_short(warnings_made):
+    """At most 60 words and two sentences.
+
+    Whatever a test makes the program warn of is measured, so that no warning escapes for want of a test of its own.
+    """
+    warnings_made.clear()
+    yield
+    for message in warnings_made:
+        assert words_in(message) <= MOST_WORDS, f"{words_in(message)} words: {message}"
+        assert len(SENTENCE_END.split(message)) <= 2, f"more than two sentences: {message}"
 
 
 @pytest.fixture

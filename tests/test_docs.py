@@ -85,7 +85,7 @@ def test_the_page_of_warnings_tells_of_every_code_in_the_order_of_what_it_costs(
     told = [tuple(re.findall(r"^### (.+)$", section, flags=re.MULTILINE)) for section in sections]
     assert told == [MISLEADING, WIDENING, HARMLESS]
     for entry in re.split(r"^### ", page, flags=re.MULTILINE)[1:]:
-        assert all(part in entry for part in ("*Says*", "*Cause*:", "*Do*:")), entry
+        assert all(part in entry for part in ("*Says*", "*Why*:", "*Do*:")), entry
 
 
 def test_every_code_of_a_warning_stands_where_the_program_gives_it():

@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import ast
 import random
+import re
+from pathlib import Path
 from types import SimpleNamespace as Stand
 
 import numpy as np
 import pytest
 
-from palpate.findings import CODES, HARMLESS, Finding, known_code, of_pair, one_a_cause, warning_rows
+from palpate.findings import (
+    CODES,
+    HARMLESS,
+    MOST_WORDS,
+    SENTENCE_END,
+    Finding,
+    known_code,
+    listing,
+    of_pair,
+    one_a_cause,
+    warning_rows,
+    words_in,
+)
 from palpate.images.alignment import Alignment, RigidFit, RigidMotion
 from palpate.images.checks import later_names
 from palpate.study.estimate_findings import inversion_findings
@@ -40,8 +55,8 @@ def test_what_costs_most_in_the_answer_comes_first_whatever_the_order_they_were_
 
 def test_a_further_pair_is_named_and_one_cause_with_the_first():
     found = one_a_cause([*of_pair(SEEN[:2], 1), *of_pair(SEEN[:1], 2)])
-    assert [finding.message for finding in found] == ["thin in before; also in after[1], pair 2: in before"]
-    assert of_pair([Finding("units", "5 Pa")], 2) == (Finding("units", "pair 2: 5 Pa"),)
+    assert [finding.message for finding in found] == ["thin in before; also in after[1], in before of pair 2"]
+    assert of_pair([Finding("units", "5 Pa")], 2) == (Finding("units", "Pair 2: 5 Pa"),)
 
 
 def test_a_code_that_is_not_registered_is_refused():
@@ -58,7 +73,7 @@ def test_bones_in_pieces_unseen_or_round_are_one_warning_each_over_all_bones_and
     of_bones = one_a_cause([finding for name in later_names(2) for finding in alignment_findings(alignment, name)])
     assert [each.code for each in of_bones] == ["several-bodies", "rotation-undetermined", "rigid-unseen"]
     assert "'hip' 2.0 mm, 'femur' 1.5 mm" in of_bones[0].message
-    assert of_bones[0].message.endswith("also in 'after[2]' ('hip' 2.0 mm, 'femur' 1.5 mm)")
+    assert "; also in 'after[2]' ('hip' 2.0 mm, 'femur' 1.5 mm). Give" in of_bones[0].message
 
 
 def test_moduli_that_depend_on_each_other_are_one_warning_with_every_pair():
@@ -74,5 +89,73 @@ def test_moduli_that_depend_on_each_other_are_one_warning_with_every_pair():
     correlation = np.array([[1.0, -0.995, 0.5], [-0.995, 1.0, 0.992], [0.5, 0.992, 1.0]])
     (finding,) = inversion_findings(inversion, correlation * np.outer(sd, sd))
     assert finding.code == "correlated"
-    assert "'prostate' and 'bladder', of 'bladder' and 'uterus' cannot" in finding.message
+    assert "the moduli of 'prostate' and 'bladder', 'bladder' and 'uterus'." in finding.message
     assert inversion_findings(inversion, np.diag(sd)) == ()
+
+
+def test_places_are_named_as_far_as_60_words_reach_and_counted_beyond():
+    text = f"{'word ' * 30}in 'before'. {'Do ' * 12}it."
+    seen = [Finding("thin", text, "prostate", f"in 'after[{number}]' ({number}%)") for number in range(40)]
+    (found,) = one_a_cause(seen)
+    assert words_in(found.message) <= MOST_WORDS
+    first, advice = SENTENCE_END.split(found.message)
+    assert first.endswith(" more")
+    assert "; also in 'after[1]' (1%), in 'after[2]' (2%)" in first
+    assert advice == f"{'Do ' * 12}it."
+    (full,) = one_a_cause([Finding("thin", "word " * 54 + "end.", "prostate", f"in {number}") for number in range(9)])
+    assert full.message.endswith("end; also in 8 more places.")
+    assert words_in(full.message) <= MOST_WORDS
+
+
+def test_a_list_is_cut_where_the_words_end_and_its_first_entry_always_stands():
+    names = [f"'tissue {number}'" for number in range(100)]
+    text = listing("Too thin: ", names, ". Use finer images.")
+    assert words_in(text) <= MOST_WORDS
+    assert text.startswith("Too thin: 'tissue 0', 'tissue 1', ")
+    assert re.search(r" and \d+ more\. Use finer images\.$", text)
+    assert listing("Too thin: ", names[:1], ".") == "Too thin: 'tissue 0'."
+    assert listing("Too thin: ", ["word " * 80, "b"], ".").endswith("and 1 more.")
+
+
+def test_a_row_leads_to_the_page_where_its_code_is_explained():
+    rows = warning_rows([Finding(code, "x") for code in CODES])
+    page = (Path(__file__).parents[1] / "docs" / "warnings.md").read_text(encoding="utf-8")
+    address = "https://github.com/palpate/palpate/blob/main/docs/warnings.md#"
+    assert [row["help"] for row in rows] == [address + code for code in CODES]
+    for row in rows:
+        assert re.search(rf"^### {row['help'].removeprefix(address)}$", page, flags=re.MULTILINE)
+    (strange,) = warning_rows([Finding("of-others", "x")])
+    assert "help" not in strange
+
+
+def texts_of_findings():
+    """Every call of `Finding` in the program with the strings that its function can make its message of."""
+    for path in sorted((Path(__file__).parents[1] / "src").rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+            calls = [
+                node
+                for node in ast.walk(function)
+                if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Finding" and len(node.args) > 1
+            ]
+            given = {
+                target.id: node.value
+                for node in ast.walk(function)
+                if isinstance(node, ast.Assign)
+                for target in node.targets
+                if isinstance(target, ast.Name)
+            }
+            for call in calls:
+                message = call.args[1]
+                message = given.get(message.id, message) if isinstance(message, ast.Name) else message
+                if isinstance(message, ast.Constant | ast.JoinedStr):
+                    parts = message.values if isinstance(message, ast.JoinedStr) else [message]
+                    text = "".join(part.value if isinstance(part, ast.Constant) else "0" for part in parts)
+                    yield pytest.param(text, id=f"{path.stem}-{call.lineno}")
+
+
+@pytest.mark.parametrize("text", [*texts_of_findings()])
+def test_a_message_as_it_is_written_says_what_is_wrong_and_then_what_to_do(text):
+    """With a word for each value; what is written in another way is measured as it is made (tests/conftest.py)."""
+    assert words_in(text) <= MOST_WORDS
+    assert len(SENTENCE_END.split(text)) <= 2

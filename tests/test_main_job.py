@@ -318,12 +318,12 @@ BAD_SETTINGS = {
     "mesh.edge_lenght_mm=4": (2, ["unknown key 'edge_lenght_mm' in [mesh]", "did you mean 'edge_length_mm'?"]),
     "tissues.shell.roll=known": (2, ["unknown key 'roll'", "did you mean 'role'?"]),
     "tissues.shell.role=estimated": (2, ["'estimated'", "did you mean 'estimate'?"]),
-    "tissues.shell.poisson_ratio=0.5": (2, ["[tissues.shell]", "0.5", "-1 < nu < 0.5", "usually given 0.40 to 0.49"]),
+    "tissues.shell.poisson_ratio=0.5": (2, ["[tissues.shell]", "0.5", "-1 < nu < 0.5", "usually has 0.40 to 0.49"]),
     "tissues.surroundings.youngs_modulus_kpa=-10": (2, ["[tissues.surroundings]", "-10", "a positive number in kPa"]),
     "tissues.surroundings.youngs_modulus_kpa=0": (2, ["[tissues.surroundings]", "a positive number in kPa"]),
     "mesh.edge_length_mm=500": (4, ["edge_length_mm is 500", "smallest side"]),
     "mechanics.law=neo-hooke": (2, ["'neo-hooke'", "did you mean 'neo-hookean'?"]),
-    "estimate.parameters=['poisson_ratio']": (2, ["[estimate] parameters", "always sought", "beside them"]),
+    "estimate.parameters=['poisson_ratio']": (2, ["[estimate] parameters", "always estimated", "on demand"]),
 }
 
 
@@ -376,4 +376,4 @@ def test_a_body_that_nothing_moves_is_refused(inputs, tmp_path, capfd):
     found, sentence = _refusal(inputs / "case.toml", tmp_path / "out", capfd, *settings)
     assert found == 2
     assert "nothing moves this body" in sentence
-    assert "give the role driver" in sentence
+    assert "Give the role driver" in sentence

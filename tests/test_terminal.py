@@ -64,6 +64,6 @@ def test_a_motion_that_is_rounding_is_none():
     turn = RigidMotion(np.eye(3), np.full(3, 3e-9))
     found = Registration("surfaces", turn, np.zeros(3), 4.7e-7)
     assert found.still
-    assert "is left where it lies" in found.in_words
+    assert "was not moved" in found.in_words
     clear = Registration("surfaces", RigidMotion(np.eye(3), np.array([0.2, 0.0, 0.0])), np.zeros(3), 4.7e-7)
-    assert "these keep less than 0.01 mm" in clear.in_words
+    assert "these surfaces then lie less than 0.01 mm apart" in clear.in_words

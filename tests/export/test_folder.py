@@ -106,7 +106,7 @@ def linked(folder):
         (linked, "incomplete"),
         (lambda folder: (folder / "labels.csv").write_text("1,liver"), "was changed"),
         (lambda folder: (folder / "model.npz").write_bytes(b"PK"), "was changed"),
-        (spoil_result, "one was changed"),
+        (spoil_result, "one of them was changed"),
         (of_another_version, "has the schema 'palpate.result/2'"),
         (without_model, "without model.npz"),
         (lambda folder: (folder / "result.json").unlink(), "there is no"),

@@ -110,7 +110,7 @@ def test_a_colour_table_keeps_its_names_as_they_stand_there(tmp_path: Path, name
             '"whole": [1, 2, 3], "core": [2, 3], "live": 3',
             "[1, 2, 3]",
             {3: "live"},
-            "'whole' ([1, 2, 3]), 'core' ([2, 3]);",
+            "'whole' ([1, 2, 3]), 'core' ([2, 3]).",
         ),
         (
             '"a": [1, 2], "b": 3, "c": 4',
@@ -118,7 +118,7 @@ def test_a_colour_table_keeps_its_names_as_they_stand_there(tmp_path: Path, name
             {4: "c"},
             "'a' ([1, 2], in a prediction [1]), 'b' ([3], in a prediction [2])",
         ),
-        ('"a": [1, 2], "b": 3', '"x"', {3: "b"}, "'a' ([1, 2]);"),
+        ('"a": [1, 2], "b": 3', '"x"', {3: "b"}, "'a' ([1, 2])."),
     ],
 )
 def test_regions_are_left_out_and_told_with_what_to_write(tmp_path: Path, labels, order, names, words) -> None:
@@ -133,7 +133,7 @@ def test_regions_are_left_out_and_told_with_what_to_write(tmp_path: Path, labels
     write_label_image(tmp_path / "a.nii.gz", image)
     assert read_label_image(tmp_path / "a.nii.gz", names=table).findings == table.findings
     path.write_text('{"labels": {"gland": [1, 3]}}')
-    with pytest.raises(InputDataError, match=r"names no label.*'gland' \(\[1, 3\]\); write the numbers"):
+    with pytest.raises(InputDataError, match=r"names no label.*'gland' \(\[1, 3\]\)\. Write the numbers"):
         read_label_table(path)
 
 

@@ -169,11 +169,11 @@ def test_a_deck_is_read_as_abaqus_reads_it(tmp_path):
         ("*PART, NAME=A\n*PART, NAME=B", "by \\*PART"),
         ("*INSTANCE, NAME=A-1, PART=A\n1.0, 0.0, 0.0", "by \\*INSTANCE"),
         ("*NODE, SYSTEM=C\n900, 1.0, 0.0, 0.0", "by \\*NODE"),
-        ("*NODE\n1, 1.0, 0.0, 0.0", "have one number"),
-        ("*ELEMENT, TYPE=S3\n900, 1, 2, 999", "name nodes that it has not"),
-        ("*ELEMENT, TYPE=C3D99X\n900, 1, 2", "'C3D99X' have not 99 nodes each"),
+        ("*NODE\n1, 1.0, 0.0, 0.0", "have the same number"),
+        ("*ELEMENT, TYPE=S3\n900, 1, 2, 999", "name nodes that do not exist"),
+        ("*ELEMENT, TYPE=C3D99X\n900, 1, 2", "'C3D99X' do not have 99 nodes each"),
         ("*ELEMENT, TYPE=C3D5\n900, 1, 2, 3, 4, 5", "it has 1 volume of 5 nodes"),
-        ("*ELEMENT, TYPE=XYZ\n900, 1, 2", "'XYZ' are not known"),
+        ("*ELEMENT, TYPE=XYZ\n900, 1, 2", "'XYZ' are not supported"),
         ("*ELEMENT, TYPE=C3D8\n900, 1, 2, 3, 4, 5, 6, 7, 8", "beside 72 tetrahedra it has 1 hexahedron"),
         ("*ELSET, ELSET=A, GENERATE\n1, 1000000000000", "over 1e.07 members"),
         ("*ELSET, ELSET=A\nB", "names a set 'B'"),
@@ -203,8 +203,8 @@ def overlapping():
 @pytest.mark.parametrize(
     ("made", "words"),
     [
-        (cracked, "18 of its nodes lie on another one that they are not joined to.*at \\[10.0, .*merge such nodes"),
-        (overlapping, "faces belong to over two tetrahedra"),
+        (cracked, "18 of its nodes lie on another node without being joined to it.*at \\[10.0, .*merge such nodes"),
+        (overlapping, "faces belong to more than two tetrahedra"),
     ],
 )
 def test_a_crack_and_an_overlap_are_refused_with_their_place(tmp_path, made, words):
@@ -258,7 +258,7 @@ def test_cell_data_that_number_groups_are_found_by_their_usual_names(tmp_path, n
     assert {number: len(own) for number, own in groups.items()} == {n: (numbers == n).sum() for n in (1, 2)}
     both = {name: [np.stack([numbers, numbers], axis=1)]}
     meshio.write(tmp_path / "m.vtu", meshio.Mesh(of.nodes, [("tetra", of.tets)], cell_data=both))
-    with pytest.raises(InputDataError, match="no whole numbers, one a cell"):
+    with pytest.raises(InputDataError, match="not one whole number for each cell"):
         read_mesh_file(tmp_path / "m.vtu")
 
 

@@ -106,13 +106,13 @@ def test_nifti_is_read_as_its_header_says(tmp_path, what, axes):
     ("what", "axes", "words"),
     [
         ({"vectors": MOVED, "four": True}, "", 'axes = "RAS"'),
-        ({"vectors": MOVED, "intent_code": 1006}, "LPS", "in RAS, as it says"),
+        ({"vectors": MOVED, "intent_code": 1006}, "LPS", "in RAS, by its header"),
         ({"vectors": MOVED, "intent_code": 1007, "intent_name": "NREG_TRANS", "intent_p1": 2.0}, "", "reg_transform"),
         ({"vectors": MOVED, "intent_code": 1007, "intent_name": "NREG_TRANS", "intent_p1": 4.0}, "", "reg_transform"),
         ({"vectors": MOVED, "intent_code": 2006}, "RAS", "warp of FSL"),
         ({"vectors": MOVED, "intent_code": 2007}, "", "warp of FSL"),
-        ({"vectors": POINTS + MOVED, "intent_code": 1006}, "", "positions in place"),
-        ({"vectors": (POINTS + MOVED) * LPS, "four": True}, "RAS", "positions in place"),
+        ({"vectors": POINTS + MOVED, "intent_code": 1006}, "", "may be positions"),
+        ({"vectors": (POINTS + MOVED) * LPS, "four": True}, "RAS", "may be positions"),
         ({"vectors": np.repeat(MOVED, 2, axis=3), "intent_code": 1007}, "", "three components"),
         ({"vectors": MOVED, "intent_code": 1007, "sform_code": 0, "qform_code": 0}, "", "neither sform nor qform"),
         ({"vectors": MOVED, "intent_code": 1006, "dim": [5, 900, 900, 900, 1, 3, 1, 1]}, "", "resample it"),
@@ -167,7 +167,7 @@ def test_nrrd_is_read_as_its_header_says(tmp_path, vectors, space, more, axes):
     ("space", "more", "axes", "words"),
     [
         ("right-anterior-superior", {}, "", "does not say"),
-        ("right-anterior-superior", {"measurement frame": np.eye(3)}, "LPS", "take the key out"),
+        ("right-anterior-superior", {"measurement frame": np.eye(3)}, "LPS", "remove the key axes"),
         ("left-posterior-superior", {"space units": ["inch"] * 3}, "", "must be"),
         ("left-posterior-superior", {"named": "scanner-xyz"}, "", "right, front and head"),
         ("left-posterior-superior", {"kinds": ["vector"] + ["domain"] * 3, "few": 2}, "", "has 2 components"),
@@ -313,5 +313,5 @@ def test_a_transform_without_a_field_and_an_unknown_kind_are_refused(tmp_path):
     with pytest.raises(InputDataError, match="holds no displacement field"):
         read(tmp_path / "shift.tfm")
     (tmp_path / "warp.m3z").write_bytes(b"")
-    with pytest.raises(InputDataError, match="no kind of field"):
+    with pytest.raises(InputDataError, match="not read as a field"):
         read(tmp_path / "warp.m3z")

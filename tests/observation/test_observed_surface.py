@@ -109,5 +109,5 @@ def test_an_organ_that_the_mesh_has_nothing_of_is_refused(meshes):
     """As one of two voxels across is, which the smoothing of the images takes away."""
     tissues = [meshes.known("fat"), meshes.unknown("organ"), meshes.unknown("sheet")]
     mesh = meshes.box_mesh(4, size=SIZE, tissues=tissues, region=lambda c: (c[:, 2] > 15.0).astype(int))
-    with pytest.raises(GeometryError, match="nothing of 'sheet' is left in the mesh"):
+    with pytest.raises(GeometryError, match="'sheet' is so thin"):
         observed_surface(lagrange_space(mesh, "P1"), 2)

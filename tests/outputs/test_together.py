@@ -127,7 +127,7 @@ def test_a_page_is_drawn_of_no_other_run_than_the_result_tells_of(estimate, out,
     before = contents(out)
     capsys.readouterr()
     assert main(["report", str(out)]) == 3
-    assert "is not of the run that the result beside it tells of" in capsys.readouterr().err
+    assert "does not belong to the result beside it" in capsys.readouterr().err
     assert contents(out) == before
 
 

@@ -10,7 +10,7 @@ from palpate.report.rows import headline, listed
 def document(*verdicts, status="converged", warnings=0, minima=(0, 0)):
     return {
         "status": status,
-        "reason": "the decrement fell under its tolerance",
+        "reason": "the predicted decrease of the objective fell below its tolerance",
         "estimates": [
             {"tissue": f"organ {i}", "parameter": "youngs_modulus", "verdict": v} for i, v in enumerate(verdicts)
         ],
@@ -65,7 +65,7 @@ def test_without_convergence_there_is_no_result(status):
     banner = headline(document("identified", status=status))
     assert banner.kind == "bad"
     assert banner.title.startswith("There is no result")
-    assert banner.sentences == ("the decrement fell under its tolerance",)
+    assert banner.sentences == ("the predicted decrease of the objective fell below its tolerance",)
 
 
 @pytest.mark.parametrize(("count", "words"), [(0, "No warnings."), (1, "1 warning"), (3, "3 warnings")])

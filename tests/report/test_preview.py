@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from bodies import ELSEWHERE, STILL, body
+from palpate.findings import HELP
 from palpate.report.preview import GENERATOR, preview_page
 from palpate.study.case import Case, CaseTissue, Images
 from palpate.study.check import Checked, CheckReport, Problem
@@ -99,7 +100,8 @@ def test_names_and_sentences_are_escaped(checked, states):
 
 def test_it_asks_for_nothing_from_elsewhere(page):
     assert "default-src 'none'" in page
-    assert not re.search(r'(?:src|href)="(?!#|data:)', page)
+    assert not re.search(r'<(?!a\b)[^>]*(?:src|href)="(?!#|data:)', page)
+    assert set(re.findall(r'<a href="([^#"][^#]*)', page)) <= {HELP}  # which is only followed
 
 
 def test_a_predicted_interval_is_called_a_prediction(checked):

@@ -45,7 +45,7 @@ def test_every_problem_is_listed_and_the_first_is_what_an_estimate_ends_with(tmp
     assert [sum(word in problem.message for problem in found.problems) for word in words] == [1] * 6
     assert found.exit_code == 2
     assert "nothing moves this body" in found.problems[0].message
-    assert found.text().splitlines()[-1].startswith("warning (units): tissue 'rest'")
+    assert found.text().splitlines()[-2].startswith("warning (units): tissue 'rest'")
 
 
 def test_a_case_that_cannot_be_read_is_a_problem_with_its_code(tmp_path, capsys):
@@ -55,6 +55,40 @@ def test_a_case_that_cannot_be_read_is_a_problem_with_its_code(tmp_path, capsys)
     assert (document["schema"], document["exit_code"]) == ("palpate.check/1", 2)
     assert [problem["severity"] for problem in document["problems"]] == ["refused"]
     assert [path.name for path in tmp_path.iterdir()] == ["case.toml"]
+
+
+def test_one_cause_in_many_images_and_pairs_is_one_line(tmp_path):
+    """The same image eight times, and in a second pair; a finding on an organ in all of them, too."""
+    write_label_image(tmp_path / "before.nii.gz", coarse_balls().before)
+    again, twice = (", ".join(['"before.nii.gz"'] * count) for count in (8, 2))
+    (tmp_path / "case.toml").write_text(
+        f'[images]\nbefore = "before.nii.gz"\nafter = [{again}]\nalign = "none"\n'
+        f'[[pairs]]\nbefore = "before.nii.gz"\nafter = [{twice}]\n'
+        '[tissues]\ncore = { label = 1, role = "estimate" }\nframe = { label = 3, role = "driver" }\n'
+        'rest = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }\n'
+    )
+    found = check_case(tmp_path / "case.toml", (), progress=silent)
+    (same,) = (problem.message for problem in found.problems if "same label image" in problem.message)
+    assert same.startswith("'before' and 'after[1]' are the same")
+    assert "; also 'after[2]', 'after[3]'" in same
+    assert "'after[1]' of pair 2" in same
+    causes = [(problem.code, problem.message.split("'")[1:2]) for problem in found.problems if not problem.exit_code]
+    assert len(set(map(str, causes))) == len(causes), causes
+    assert found.text().count("each code is explained on") == bool(causes)
+
+
+def test_refusals_of_one_cause_with_other_numbers_are_one_line():
+    problems = check._Problems()
+    for number, change in enumerate((31.0, 45.5, 60.0), start=1):
+        place = f"'after[{number}]'"
+        text = f"the volume of 'core' changes by {change:+.1f}% from 'before' to {place}: check its label"
+        problems.add(check.Problem("InputDataError", text, 3, place))
+    problems.add(
+        check.Problem("InputDataError", "the volume of 'rim' changes by +31.0% from 'before' to 'after[1]'", 3)
+    )
+    core, rim = problems.all()
+    assert core.message.endswith(": check its label; also 'after[2]', 'after[3]'")
+    assert "'rim'" in rim.message
 
 
 def test_half_the_edge_length_costs_about_eight_times_the_tetrahedra(case_result):

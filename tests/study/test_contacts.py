@@ -43,14 +43,14 @@ def test_a_free_organ_touches_nothing():
 def test_one_face_of_a_cube_on_a_driver_is_a_sixth_of_its_surface():
     (finding,) = contact_findings(scene(ORGAN, (1, (6, 16), (16, 20), (6, 16))))
     assert finding.code == "touching"
-    assert "tube (17%)" in finding.message
+    assert "'tube' (17%)" in finding.message
     assert "83%" in finding.message
 
 
 def test_of_an_organ_that_a_driver_encloses_nothing_is_left_to_observe():
     (finding,) = contact_findings(scene((1, (4, 18), (4, 18), (4, 18)), ORGAN))
     assert finding.code == "touching"
-    assert "0% of its surface is left" in finding.message
+    assert "so 0% of its surface is observed" in finding.message
 
 
 def test_the_surface_of_a_void_is_free_and_observed():
@@ -79,7 +79,7 @@ def test_a_load_moves_organs_so_that_nothing_else_has_to():
     assert [finding.code for finding in motion_findings(before, after, "after")] == ["motion-below-noise"]
     assert motion_findings(before, after, "after", loaded=True) == ()
     (finding,) = motion_findings(before, before, "after", loaded=True)
-    assert "organ 0 mm" in finding.message
+    assert "'organ' 0 mm" in finding.message
 
 
 def test_sides_that_are_exchanged_are_named():

@@ -55,12 +55,12 @@ def test_the_frame_moves_as_the_faces_on_the_cut_do(found):
 def test_a_drawing_that_differs_is_said_in_words(found):
     (finding,) = discrepancy_findings(found)
     assert finding.code == "drawn-otherwise"
-    assert f"'gland' is drawn {found.offsets[0].mm:.2g} mm larger on every side in 'after'" in finding.message
+    assert f"'gland' in 'after' lies {found.offsets[0].mm:.2g} mm further out than" in finding.message
 
 
 @pytest.mark.parametrize(
     ("mm", "half", "words"),
-    [(-1.2, 0.4, "1.2 mm thinner or smaller"), (-1.2, 1.3, None), (0.09, 0.01, None), (0.3, 0.1, "0.3 mm larger")],
+    [(-1.2, 0.4, "1.2 mm further in"), (-1.2, 1.3, None), (0.09, 0.01, None), (0.3, 0.1, "0.3 mm further out")],
 )
 def test_only_what_is_larger_than_two_standard_deviations_and_a_tenth_of_a_millimetre_is_told(mm, half, words):
     offset = OffsetFound("rectum", 1, mm, (mm - half, mm + half))

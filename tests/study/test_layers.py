@@ -138,7 +138,7 @@ def test_a_layer_is_said_in_words_and_stands_in_the_material(sheathed, twin):
     assert gland.interval95[0] < np.exp(SOFT) < gland.interval95[1]
     assert (gland.told, sac.told) == (True, False)
     (finding,) = [finding for finding in discrepancy_findings(found) if finding.code == "layer"]
-    assert f"round 'gland' lies a layer that is {gland.ratio:.2g} times as stiff" in finding.message
+    assert f"a layer around 'gland' that is {gland.ratio:.2g} times as stiff" in finding.message
     (material,) = fitted_materials(inversion)
     model, parameters = inversion.objective.states[0].model, inversion.objective.parameters
     moduli = dict(zip(model.regions, parameters.moduli(inversion.minimum.unknowns), strict=True))

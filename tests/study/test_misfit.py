@@ -153,7 +153,7 @@ def test_a_tenth_of_the_points_that_lies_far_off_is_counted_and_its_worst_one_pl
     errors[70, 1] += 8.0 * SD
     text = points.text(errors)
     assert "misses 30 of 300 points of the field in state 1" in text
-    assert f"the one at {np.round(points.places[70], 1).tolist()} mm (RAS): by 1." in text
+    assert f"the one at {np.round(points.places[70], 1).tolist()} mm (RAS) by 1." in text
 
 
 def test_a_tail_that_is_too_long_is_a_misfit_though_the_mean_square_is_not(measured):
@@ -172,7 +172,7 @@ def test_one_landmark_that_is_another_is_named(measured, n):
     errors[2] = [20.0 * SD, 0.0, 0.0]
     text = points.text(errors)
     assert f"misses 1 of {n} points" in text
-    assert "'bead-3': by 2 mm, 20 times" in text
+    assert "'bead-3' by 2 mm, 20 times" in text
 
 
 def test_points_that_all_lie_off_alike_are_not_counted_one_by_one(measured):
@@ -236,9 +236,9 @@ def test_a_surface_that_is_drawn_otherwise_is_named_whole_or_in_part(smooth_nois
     (whole,) = misfits_of_surface(values + 0.6)
     rms = float(np.sqrt(np.mean((values + 0.6) ** 2)))
     assert f"misses the surface of 'organ' in state 1 by {rms:.2g} mm" in whole.text
-    assert f"{whole.times:.2g} times what the noise of 0.3 mm that the image shows explains" in whole.text
+    assert f"{whole.times:.2g} times what the estimated noise of 0.3 mm explains" in whole.text
     (part,) = misfits_of_surface(0.3 * values + 1.0 * cap)
-    assert "by 0.34 mm (root mean square) and 5% of it by 0.93 mm" in part.text
+    assert "by 0.34 mm (root mean square; 95th percentile 0.93 mm)" in part.text
     assert part.times > 1.5
 
 
@@ -246,7 +246,7 @@ def test_a_surface_is_held_against_the_noise_that_is_stated(smooth_noise):
     """Though the residuals count by a larger one; rounding to voxels is never a misfit; nor is a driver's wall."""
     stated = NoiseModel(np.array([0.1**2]), np.array([3.0]))
     (misfit,) = misfits_of_surface(smooth_noise[0], stated_noise=stated)
-    assert f"{misfit.times:.2g} times what the noise of 0.1 mm that is stated explains" in misfit.text
+    assert f"{misfit.times:.2g} times what the stated noise of 0.1 mm explains" in misfit.text
     assert misfit.times == pytest.approx(3.0, rel=0.1)
     assert misfits_of_surface(0.4 * smooth_noise[0], scale=0.01) == ()
     assert misfits_of_surface(10.0 * smooth_noise[0], tissue=1) == ()
@@ -273,7 +273,7 @@ def misfits_of_reading(left):
 def test_a_force_that_is_missed_is_named():
     assert misfits_of_reading(-0.3) == ()
     (misfit,) = misfits_of_reading(-0.5)
-    assert "needs 1.5 N for the force in state 1, where 2 N was measured: 5 times the stated error" in misfit.text
+    assert "needs 1.5 N for the force in state 1, but 2 N was measured, which differs by 5 times" in misfit.text
 
 
 def test_every_verdict_tells_of_the_worst_misfit(case_result):

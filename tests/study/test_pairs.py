@@ -102,9 +102,9 @@ def test_findings_on_a_further_pair_name_it_once(outputs, inputs):
     said = [warning["message"] for warning in json.loads((outputs / "result.json").read_text())["warnings"]]
     assert states.findings
     for finding in states.findings:
-        of_pair_2 = f"pair 2: {finding.place}" if finding.place else f"pair 2: {finding.message}"
+        of_pair_2 = f"{finding.place} of pair 2" if finding.place else f"Pair 2: {finding.message}"
         assert any(of_pair_2 in message for message in said), said
-    assert not any("pair 2: pair 2" in message for message in said)
+    assert not any("Pair 2: Pair 2" in message for message in said)
 
 
 def test_pairs_without_images_are_refused(tmp_path):

@@ -101,7 +101,7 @@ def test_tissues_that_a_phantom_has_not_are_refused(override, words, tmp_path):
 
 
 def test_loads_on_a_phantom_are_refused(tmp_path):
-    with pytest.raises(ConfigurationError, match="take the loads out"):
+    with pytest.raises(ConfigurationError, match="remove the loads"):
         case_of(tmp_path, "spheres", "loads=[{kind='gravity', acceleration_m_s2=[0.0, 0.0, 1.0]}]")
 
 

@@ -205,7 +205,7 @@ def test_a_surface_whose_drawing_is_an_unknown_is_not_moved_beside_it(case_file)
     rows = fast_variations(inversion, settings, tissues, dilatation=linear, voxel_mm=1.0)
     drawn = [row for row in rows if row.cause == "segmentation" and row.subject in sought]
     assert {row.subject for row in drawn} == sought
-    assert all(row.changes is None and "interval holds it" in row.reason for row in drawn)
+    assert all(row.changes is None and "interval includes it" in row.reason for row in drawn)
     indices = sobol_result(inversion, settings, tissues, dilatation=linear, voxel_mm=1.0, n=2, seed=0)
     assert not sought & {of.subject for of in indices.inputs if of.cause == "segmentation"}
 

@@ -31,9 +31,9 @@ def stretched(space, amount, share=1.0):
 def test_large_strains_under_the_linear_law_are_warned_of(space):
     (remark,) = linear_strain_warnings(LAWS["linear"], (space, [stretched(space, 0.2)]), images=["late.nii"])
     assert remark.code == "linear-strains"
-    for words in ("late.nii: 100.0 %", "99th percentile 22 %", 'law = "neo-hookean"'):  # (1.2^2 - 1) / 2 = 0.22
+    for words in ("In 'late.nii' 100.0 %", "99th percentile 22 %", 'law = "neo-hookean"'):  # (1.2^2 - 1) / 2 = 0.22
         assert words in remark.message
-    assert "free of stress (the emptier one) as images.before" in remark.message
+    assert "free of stress, the emptier one, as 'before'" in remark.message
 
 
 def test_small_strains_pass(space):
@@ -49,7 +49,7 @@ def test_the_share_is_that_of_the_volume(space):
     (remark,) = linear_strain_warnings(LAWS["linear"], (space, [stretched(space, 0.3, share=0.3)]), images=["a"])
     volumes, height = space.mesh.volumes, space.mesh.nodes[:, 2]
     below = height[space.mesh.tets].max(axis=1) <= height.min() + 0.3 * np.ptp(height) + 1e-9
-    assert f"a: {100 * volumes[below].sum() / volumes.sum():.1f} %" in remark.message
+    assert f"In 'a' {100 * volumes[below].sum() / volumes.sum():.1f} %" in remark.message
 
 
 def test_the_image_that_strains_most_is_named(space):
@@ -57,7 +57,7 @@ def test_the_image_that_strains_most_is_named(space):
     (remark,) = linear_strain_warnings(
         LAWS["linear"], (space, motions[:1]), (space, motions[1:]), images=["one", "two", "three"]
     )
-    assert remark.message.startswith("two:")
+    assert remark.message.startswith("In 'two'")
 
 
 def test_nothing_fitted_is_nothing_strained(space):

@@ -92,11 +92,11 @@ def test_what_is_no_closed_surface_is_refused(tmp_path):
     whole = box([0.0] * 3, [10.0] * 3)
     turned = np.concatenate([whole[:5, ::-1], whole[5:]])
     wrong = {
-        "open": (stl(tmp_path / "open.stl", whole[1:]), "is not closed .11 triangles, 3 edges"),
+        "open": (stl(tmp_path / "open.stl", whole[1:]), "is not closed .3 edges of its 11 triangles"),
         "none": (tmp_path / "none.stl", "cannot be read"),
-        "cut": (stl(tmp_path / "cut.stl", whole), "is no STL"),
+        "cut": (stl(tmp_path / "cut.stl", whole), "is not an STL"),
         "text": (stl(tmp_path / "text.stl", whole, text=True), "damaged text"),
-        "nan": (stl(tmp_path / "nan.stl", np.where(whole == 10.0, np.nan, whole)), "no number of millimetres"),
+        "nan": (stl(tmp_path / "nan.stl", np.where(whole == 10.0, np.nan, whole)), "too large for millimetres"),
         "empty": (stl(tmp_path / "empty.stl", whole[:0]), "is not closed"),
         "turned": (stl(tmp_path / "turned.stl", turned), "beside 9 of 18 edges of .* face opposite ways"),
     }
@@ -113,7 +113,7 @@ def test_what_is_no_closed_surface_is_refused(tmp_path):
         (1e-3, 0.0, "1000 times as large it would be 27 mL: where the file is in metres, write --scale 1000"),
         (0.1, 0.0, "10 times as large it would be 27 mL: where the file is in centimetres, write --scale 10"),
         (0.05, 0.0, "has 0 voxels: it holds 0.00337 mL"),
-        (1.0, 300.0, "has 0 voxels: .* are its unit and its axes right"),
+        (1.0, 300.0, "has 0 voxels: .* check its unit and its axes"),
     ],
 )
 def test_an_organ_without_voxels_is_refused_with_what_to_write(tmp_path, factor, shift, words):
@@ -184,7 +184,7 @@ def test_a_text_too_large_to_be_taken_apart_is_refused_before_it_is(tmp_path):
 def test_names_that_stand_twice_and_grids_beyond_all_are_refused(tmp_path):
     (tmp_path / "other").mkdir()
     twice = [stl(folder / "organ.stl", box([0.0] * 3, [10.0] * 3)) for folder in (tmp_path, tmp_path / "other")]
-    with pytest.raises(ConfigurationError, match="2 surfaces are named, of 1 names"):
+    with pytest.raises(ConfigurationError, match="2 surfaces are given, with 1 different names"):
         surface_labels(twice)
     with pytest.raises(ResourceError, match="voxels"):
         surface_labels(twice[:1], spacing_mm=0.01)

@@ -96,7 +96,7 @@ def test_an_image_that_contradicts_the_others_is_named_with_what_they_say():
     first, second = pair_findings(ImagePairs(tuple(alone), 1e-4, {"p": 0.1}, {"p": 31.0}, {"p": (29.0, 33.0)}))
     assert (first.code, second.code) == ("pair-outlier", "heterogeneous")
     assert "'after[2]' contradicts" in first.message
-    assert "p 31" in first.message
+    assert "'p' by +4.0 standard deviations (31 without it)" in first.message
 
 
 @pytest.mark.parametrize(("noises", "named"), [((0.3, 0.4, 0.9), 1), ((0.3, 0.4, 0.45), 0), ((0.3, 0.9), 0)])
@@ -106,7 +106,7 @@ def test_an_image_whose_surfaces_fit_far_worse_is_named(noises, named):
     found = pair_findings(ImagePairs(tuple(alone), 0.5, {"p": 0.1}, {"p": 31.0}, {"p": (29.0, 33.0)}))
     assert [finding.code for finding in found] == ["pair-noise"] * named
     assert all("'after[3]' fits worse" in finding.message for finding in found)
-    assert all("0.9 mm beside 0.35 mm" in finding.message for finding in found)
+    assert all("0.9 mm instead of 0.35 mm" in finding.message for finding in found)
 
 
 def test_a_region_is_stated_in_kpa_around_the_estimate_of_both(single, settings):

@@ -27,9 +27,8 @@ def determined() -> Iterator[None]:
         yield
     except np.linalg.LinAlgError as error:
         raise EstimationError(
-            f"the images do not determine what is sought ({error}): beside the noise ([noise] surface_sd_mm, or that of"
-            " the residuals) the driver's motion cannot be told from none; state the noise smaller, or use images in"
-            " which the organs move more"
+            f"the images do not determine the unknowns ({error}): the driver's motion vanishes in the noise ([noise]"
+            " surface_sd_mm, or that of the residuals); state smaller noise, or use images with a larger motion"
         ) from error
 
 

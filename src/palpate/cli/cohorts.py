@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from palpate.cli.outcome import Outcome, columns
 from palpate.errors import ConfigurationError, ResourceError
+from palpate.findings import some
 from palpate.progress import Line, Progress, counted
 
 if TYPE_CHECKING:
@@ -167,8 +168,8 @@ def _associations(document: dict[str, Any]) -> str:
             low, high = found["interval95"]
             cells = [number(found["factor_per_stage"]), interval_text((low, high)), number(found["p"], digits=2)]
         rows.append([tissue, *(str(used[name]) for name in ("patients", "scans", "censored")), *cells])
+    shared = [", ".join(row["id"] for row in image["rows"]) for image in document["identical_images"]]
     same = [
-        f"the same image, to the byte, in several patients: {', '.join(row['id'] for row in image['rows'])}"
-        for image in document["identical_images"]
-    ]
+        f"the same image, byte for byte, in several patients: {some(list(dict.fromkeys(shared)))}; correct the table"
+    ] * bool(shared)
     return "\n".join([columns(rows), *same])

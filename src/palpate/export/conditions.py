@@ -60,5 +60,7 @@ def prescribed(body: FittedBody, space: LagrangeSpace, *, outer: str) -> Prescri
     sliding = np.flatnonzero((counts > 0.0) & (counts < 3.0))
     share = free[sliding]
     if np.any(np.minimum(share, 1.0 - share) > IN_FRAME):
-        raise ConfigurationError("the sliding faces do not lie along the image's axes, which no export can state")
+        raise ConfigurationError(
+            "the sliding faces do not lie along the image's axes, so no export can describe them; choose vtu"
+        )
     return Prescribed(np.flatnonzero(counts == 0.0), sliding, share < 0.5, axes)

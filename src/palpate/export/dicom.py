@@ -234,9 +234,7 @@ def _series(folder: Path, body: FittedBody) -> list[Dataset]:
             raise InputDataError(f"{path} cannot be read as DICOM ({type(error).__name__})") from error
     series = {str(head.SeriesInstanceUID) for head in found}
     if len(series) != 1:
-        raise InputDataError(
-            f"{folder} holds the slices of {len(series)} series; put those of the one that was segmented there"
-        )
+        raise InputDataError(f"{folder} holds the slices of {len(series)} series; keep only the one that was segmented")
     # raise `InputDataError` where the middle of the first image does not lie within the series
     across, down = np.array(found[0].ImageOrientationPatient, dtype=float).reshape(2, 3)
     axes = np.stack([across, down, np.cross(across, down)])
@@ -245,5 +243,7 @@ def _series(folder: Path, body: FittedBody) -> list[Dataset]:
     size = np.array([columns * found[0].Columns, rows * found[0].Rows, 0.0])
     middle = LPS[:3, :3] @ body.grid.world(0.5 * (np.array(body.grid.shape) - 1.0)[None])[0] @ axes.T
     if not ((places.min(axis=0) <= middle) & (middle <= places.max(axis=0) + size)).all():
-        raise InputDataError(f"the series in {folder} does not lie where the first image of the result does")
+        raise InputDataError(
+            f"the series in {folder} lies elsewhere than the first image of the result; name the series of that image"
+        )
     return found

@@ -38,8 +38,9 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     held = prescribed(body, space, outer=model.outer_boundary)
     if not held.along_world:
         raise ConfigurationError(
-            'with outer_boundary = "sliding" the cut of the image slides along the image\'s own axes, which lie askew'
-            " to the world's; FEBio holds nodes along these only: export to abaqus, or estimate with another boundary"
+            'with outer_boundary = "sliding" the cut of the image slides along the image\'s axes, which are oblique to'
+            " the world's; FEBio holds nodes only along the world's: export to abaqus, or estimate with another"
+            " boundary"
         )
     acting = list(dict.fromkeys(load for of_image in body.loads for load in of_image))
     loads = loads_on(space, acting, densities=model.densities)

@@ -108,15 +108,15 @@ class FittedModel:
         """
         if self.strained:
             raise ConfigurationError(
-                "the reference bears loads, and the mesh shows it strained by them: another program would take it for"
-                " free of stress; export to vtu, whose fields are those of the estimate"
+                "the reference state is loaded, but another program would take its mesh as free of stress; export to"
+                " vtu, whose fields are those of the estimate"
             )
         law = self.material_law
         if not isinstance(law, written):
             names = " and ".join(f"'{kind().name}'" for kind in written)
             raise ConfigurationError(
-                f"the law '{self.law}' is none that this format is written for ({names}): another program would compute"
-                " with another material; export to vtu, whose fields are those of the estimate"
+                f"the law '{self.law}' is not supported by this format, which has {names}; export to vtu, whose fields"
+                " are those of the estimate"
             )
         return law
 
@@ -148,7 +148,7 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
     if estimation.status != "converged":
         raise EstimationError(
             f"the estimate ended with the status '{estimation.status}' ({estimation.reason}), so there is no model to"
-            " export: nothing that did not converge is passed on"
+            " export; an estimate that did not converge cannot be exported"
         )
     pairs: list[tuple[CaseResult | PairResult, tuple[NDArray[np.float64], ...]]] = []
     pairs += [(result, result.displacements)]

@@ -36,14 +36,13 @@ def read_model(folder: Path) -> FittedModel:
         )
     if document.get("status") != "converged":
         raise EstimationError(
-            f"{path} tells of an estimate with the status '{printable(str(document.get('status'))[:40])}'; nothing that"
-            " did not converge is exported"
+            f"{path} is of an estimate with the status '{printable(str(document.get('status'))[:40])}'; only converged"
+            " estimates can be exported"
         )
     files = document.get("files", {})
     if MODEL not in files:
         raise InputDataError(
-            f"{path} tells of a run without {MODEL}, from which files for other programs are made; run the estimate"
-            " again with this version"
+            f"{path} is of a run without {MODEL}, from which exports are made; run the estimate again with this version"
         )
     for name, entry in files.items():
         own = folder / name
@@ -54,13 +53,13 @@ def read_model(folder: Path) -> FittedModel:
             )
         if sha256_of(own) != entry["sha256"]:
             raise InputDataError(
-                f"{own} was changed after the estimate that {RESULT} tells of (its SHA-256 is another); run the"
-                " estimate again, into another folder"
+                f"{own} was changed after the estimate of {RESULT} (its SHA-256 differs); run the estimate again, into"
+                " another folder"
             )
     model = read_archive(FittedModel, folder / MODEL, version=FORMAT, sha256=files[MODEL]["sha256"])
     if model.seal != seal_of(document):
         raise InputDataError(
-            f"the numbers in {path} are not those of the run that wrote {MODEL}: one was changed since; run the"
+            f"the numbers in {path} are not those of the run that wrote {MODEL}: one of them was changed; run the"
             " estimate again"
         )
     for body in model.bodies:

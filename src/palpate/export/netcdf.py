@@ -66,8 +66,8 @@ def write_posterior(model: FittedModel, path: Path) -> None:
         h5netcdf = import_module("h5netcdf")
     except ImportError as error:
         raise ResourceError(
-            "NetCDF is written by h5netcdf, which is not installed: pip install 'palpate[netcdf]'; without it, export"
-            " to csv holds the same samples"
+            "NetCDF is written by h5netcdf, which is not installed: pip install 'palpate[netcdf]'; the export to csv"
+            " holds the same samples"
         ) from error
     samples, unit = moduli_samples(model), "kPa" if model.unit == "kPa" else f"ratio to {model.relative_to}"
     chains, draws, n = samples.moduli.shape

@@ -40,8 +40,8 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     held = prescribed(linear, linear.space, outer=model.outer_boundary)
     if any(body.loads) or not held.along_world:
         raise ConfigurationError(
-            "the SOFA scene has neither known loads nor faces that slide askew to the world's axes; export to abaqus or"
-            " febio"
+            "a SOFA scene can hold neither known loads nor faces that slide obliquely to the world's axes; export to"
+            " abaqus or febio"
         )
     mesh, parts = body.mesh, material_parts(body.mesh, body.log_ratio)
     part = np.empty(len(mesh.tets), dtype=np.int64)

@@ -168,8 +168,8 @@ def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidF
         n = sum(len(surface.area) for surface in surfaces)
         if n < MIN_POINTS:
             raise InputDataError(
-                f"the {where} image shows {n} surface points of the rigid tissue away from its border, {MIN_POINTS} are"
-                " needed; enlarge the image, or give the tissue another role"
+                f"the '{where}' image shows only {n} surface points of the rigid tissue away from its border, and"
+                f" {MIN_POINTS} are needed; use a larger field of view, or give the tissue another role"
             )
     centre, spread = _moments([match.surface for match in matches])
     aim, aimed = _moments(target)
@@ -311,8 +311,8 @@ def _state(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
     inside = np.concatenate([within_border(m.after.grid, x) for m, x in zip(matches, groups, strict=True)])
     if np.count_nonzero(inside) < MIN_POINTS:
         raise InputDataError(
-            f"only {np.count_nonzero(inside)} of {len(places)} surface points of the rigid tissue come to lie inside"
-            " the after image; the images show different parts of the body"
+            f"only {np.count_nonzero(inside)} of {len(places)} surface points of the rigid tissue lie inside the"
+            " 'after' image; the images show different parts of the body: check both"
         )
     return _State(motion, residual, np.hstack([np.cross(places - centre, slope), slope]), area * inside, centre, radius)
 

@@ -1,4 +1,4 @@
-"""Where the body ends in a CT: what of an image is air around it, or the table that it lies on."""
+"""The outside of the body in a CT: the air around it, and the table that it lies on."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def outside_body(values: NDArray[np.float32], grid: VoxelGrid, on: VoxelGrid) ->
     """
     if not shows_air(values):
         raise InputDataError(
-            f"the grey image has no value under {CERTAINLY_AIR_HU:g}, so it shows no air or is no CT in Hounsfield"
-            " units; body_from_ct cannot find the body in it: leave it out"
+            f"the grey image has no value under {CERTAINLY_AIR_HU:g}, so it shows no air or is not a CT in Hounsfield"
+            " units. body_from_ct cannot find the body in it: remove that key"
         )
     step = np.maximum(np.floor(COARSE_MM / grid.spacing), 1).astype(int)
     affine = grid.affine @ np.diag([*step, 1.0])

@@ -1,4 +1,4 @@
-"""Checks of segmented images before anything is computed from them: what is refused, and what the user should know."""
+"""Checks of segmented images before anything is computed from them: refusals and warnings."""
 
 from __future__ import annotations
 
@@ -80,10 +80,10 @@ def later_names(count: int) -> list[str]:
 
 
 def check_headers(before: VoxelGrid, after: VoxelGrid, name: str) -> tuple[Finding, ...]:
-    """What the grids of two images, as they were read, say of slips in their headers.
+    """Findings on probable errors in the headers of two images, from their grids as they were read.
 
-    Spacings that differ by a per cent, and origins that differ by half a voxel, deform or move every organ by as much
-    as its stiffness does; no two scans are usually so alike and not the same.
+    Spacings that differ by about 1 % stretch every organ, and origins that differ by half a voxel move it, as much as
+    its stiffness does. Two scans are rarely so alike without being the same.
     """
     ratio = after.spacing / before.spacing - 1.0
     odd = [axis for axis in range(3) if SAME_SPACING < abs(ratio[axis]) < NEARLY_SAME_SPACING]
@@ -91,9 +91,9 @@ def check_headers(before: VoxelGrid, after: VoxelGrid, name: str) -> tuple[Findi
         axis = max(odd, key=lambda a: abs(ratio[a]))
         sizes = f"{before.spacing[axis]:.5g} and {after.spacing[axis]:.5g} mm"
         text = (
-            f"voxels of 'before' and '{name}' differ by {abs(ratio[axis]):.2%} along image axis {axis + 1} ({sizes}): a"
-            " spacing that was rounded or mistyped in a header stretches all organs by as much, which no stiffness"
-            " explains; compare both headers with the scanner's, or with the DICOM series"
+            f"The voxels of 'before' and '{name}' differ by {abs(ratio[axis]):.2%} along image axis {axis + 1}"
+            f" ({sizes}), as if a spacing was rounded or mistyped; all organs then seem stretched by as much. Compare"
+            " both headers with the DICOM series."
         )
         return (Finding("spacing-nearly-same", text, place=f"in '{name}' ({abs(ratio[axis]):.2%})"),)
     if before.shape != after.shape or np.abs(before.affine[:3, :3] - after.affine[:3, :3]).max() > SAME_SPACING:
@@ -104,8 +104,8 @@ def check_headers(before: VoxelGrid, after: VoxelGrid, name: str) -> tuple[Findi
         return ()
     shift = " x ".join(f"{part:.2g}" for part in np.abs(offset))
     text = (
-        f"'before' and '{name}' have the same voxels, and origins that differ by {shift} of one: so do headers"
-        " of which one gives the centre of the first voxel and the other its corner; compare both with the scanner's"
+        f"The origins of 'before' and '{name}' differ by {shift} voxels, as if one header gives the centre of the first"
+        " voxel and the other its corner. Compare both origins with the DICOM series."
     )
     return (Finding("half-voxel", text, place=f"in '{name}'"),)
 
@@ -129,7 +129,8 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
     spacing = segmentation.grid.spacing
     if not SPACING_MM[0] <= float(spacing.min()) <= float(spacing.max()) <= SPACING_MM[1]:
         size = " x ".join(f"{edge:.4g}" for edge in spacing)
-        text = f"'{name}' has voxels of {size} mm; is its header in metres or micrometres? Set its unit of length"
+        unit = "metres" if float(spacing.min()) < SPACING_MM[0] else "micrometres"
+        text = f"'{name}' has voxels of {size} mm, as if its header is in {unit}. Set the unit of length in the header."
         findings.append(Finding("voxel-size", text, place=f"'{name}'"))
     for i, tissue in enumerate(segmentation.tissues):
         if tissue.role not in OBSERVED:
@@ -142,8 +143,8 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
             if touching := _touching(mask):
                 share = f"{touching / (touching + sum(_faces(mask))):.1%}"
                 text = (
-                    f"'{tissue.name}' reaches the border of '{name}': {share} of its surface is a cut of the image,"
-                    " which says nothing about its stiffness; a larger field of view is better"
+                    f"'{tissue.name}' reaches the border of '{name}': {share} of its surface is only the cut of the"
+                    " image, where its motion is unknown. Use a larger field of view, if there is one."
                 )
                 findings.append(Finding("cut-by-border", text, tissue.name, f"in '{name}' ({share})"))
             findings += _too_thin(segmentation.index == i, box, tissue, name)
@@ -151,8 +152,9 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
             if count > 1:
                 sizes = np.sort(np.bincount(parts.ravel())[1:])
                 text = (
-                    f"'{tissue.name}' has {count} separate pieces in '{name}', {sizes[:-1].sum() / sizes.sum():.2%} of"
-                    " it outside the largest; remove stray voxels from the labels"
+                    f"'{tissue.name}' has {count} separate pieces in '{name}', with"
+                    f" {sizes[:-1].sum() / sizes.sum():.2%} of its volume outside the largest. Remove stray voxels from"
+                    " the labels."
                 )
                 findings.append(Finding("islands", text, tissue.name, f"in '{name}' ({count})"))
     return tuple(findings)
@@ -180,19 +182,19 @@ def refuse_absent(before: Segmentation, after: Sequence[Segmentation]) -> None:
         for tissue, names in ((before.tissues[i], names) for i, names in absent.items())
     ]
     raise InputDataError(
-        f"{'; '.join(lost)}. An organ must be seen in all states: check its label in the images, or take the tissue out"
-        " of the case"
+        f"{'; '.join(lost)}. Every image must show it: check its label in the images, or remove the tissue from the"
+        " case"
     )
 
 
 def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after") -> tuple[Finding, ...]:
-    """Findings on two states of one body: volumes, shifts, a mirrored image, the part that the images share.
+    """Findings on two states of one body: changes of volume, large shifts, mirrored images, little overlap.
 
     Raises `InputDataError` when the two are the same image, an organ has another name in one of them, they share no
     part of the world, one is clearly the mirror image of the other, or two organs have exchanged their labels.
     """
     if [t.name for t in before.tissues] != [t.name for t in after.tissues]:
-        raise InputDataError(f"'before' and '{name}' have been segmented into different tissues; use one list for both")
+        raise InputDataError(f"'before' and '{name}' are segmented into different tissues; use the same list for both")
     # 3D Slicer numbers segments anew in each file: one number may be two organs
     for here, there in zip(before.tissues, after.tissues, strict=True):
         names = [sorted(word.casefold() for word in tissue.called) for tissue in (here, there)]
@@ -204,8 +206,8 @@ def check_pair(before: Segmentation, after: Segmentation, *, name: str = "after"
             )
     if np.array_equal(before.index, after.index):
         raise InputDataError(
-            f"'before' and '{name}' are the same label image, voxel by voxel; without a deformation nothing can be"
-            " estimated: check the two paths"
+            f"'before' and '{name}' are the same label image, voxel by voxel, so there is no deformation to estimate"
+            " from; check the two paths"
         )
     findings = _common_part(before, after, name)
     observed = [i for i, tissue in enumerate(before.tissues) if tissue.role in OBSERVED]
@@ -230,10 +232,13 @@ def _faces(mask: NDArray[np.bool_]) -> list[int]:
 
 
 def _too_thin(mask: NDArray[np.bool_], box: tuple[slice, ...], tissue: Tissue, name: str) -> list[Finding]:
-    """Few voxels at all, or many that no cube of THIN_VOXELS inside the organ covers; box: the bounding one."""
+    """A finding where an organ has few voxels, or many that no cube of THIN_VOXELS inside it covers.
+
+    box: the organ's bounding box.
+    """
     count = int(np.count_nonzero(mask[box]))
     if count < SMALL_VOXELS:
-        text = f"'{tissue.name}' has only {count} voxels in '{name}'; its surface cannot be trusted: use finer images"
+        text = f"'{tissue.name}' has only {count} voxels in '{name}', so its surface is not reliable. Use finer images."
         return [Finding("too-small", text, tissue.name, f"in '{name}' ({count})")]
     window = tuple(slice(max(s.start - THIN_VOXELS, 0), s.stop + THIN_VOXELS) for s in box)
     missing = [
@@ -246,8 +251,8 @@ def _too_thin(mask: NDArray[np.bool_], box: tuple[slice, ...], tissue: Tissue, n
     if share <= THIN_SHARE:
         return []
     text = (
-        f"{share:.0%} of '{tissue.name}' in '{name}' is thinner than {THIN_VOXELS} voxels; its surface there is known"
-        " to about half a voxel only: use finer images, or join it to its neighbour"
+        f"{share:.0%} of '{tissue.name}' in '{name}' is thinner than {THIN_VOXELS} voxels, so its surface there is"
+        " known only to about half a voxel. Use finer images, or join it to its neighbour."
     )
     return [Finding("thin", text, tissue.name, f"in '{name}' ({share:.0%})")]
 
@@ -257,13 +262,15 @@ def _common_part(before: Segmentation, after: Segmentation, name: str) -> list[F
     if share == 0.0:
         centres = [grid.world((np.array([grid.shape]) - 1.0) / 2.0)[0] for grid in (before.grid, after.grid)]
         raise InputDataError(
-            f"'before' and '{name}' have no part of the world in common: their centres lie at"
-            f" {np.round(centres[0], 1).tolist()} and {np.round(centres[1], 1).tolist()} mm; check the headers, or"
-            " register the images first"
+            f"'before' and '{name}' do not overlap in space: their centres lie at {np.round(centres[0], 1).tolist()}"
+            f" and {np.round(centres[1], 1).tolist()} mm (RAS); check the headers, or register the images first"
         )
     if share >= COMMON_SHARE:
         return []
-    text = f"'before' and '{name}' share only {share:.0%} of the smaller image; surfaces outside of it are not compared"
+    text = (
+        f"'before' and '{name}' share only {share:.0%} of the smaller image; surfaces outside that part are not"
+        " compared. Check the headers, unless the fields of view differ so much."
+    )
     return [Finding("little-in-common", text, place=f"'{name}' ({share:.0%})")]
 
 
@@ -309,15 +316,15 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
         one, other = (before.tissues[observed[k]].name for k in (i, j))
         now, then = (own[i] + own[j]) / 2.0, (found[i, j] + found[j, i]) / 2.0
         raise InputDataError(
-            f"'{one}' and '{other}' look exchanged in '{name}': {then:.0%} of their voxels lie in the other"
-            f" organ there, {now:.0%} in their own; check which label is which in that image"
+            f"'{one}' and '{other}' look exchanged in '{name}': {then:.0%} of their voxels lie in the other tissue"
+            f" there, and {now:.0%} in their own; check which label is which in that image"
         )
     if best - plain < MIRROR_LIKELY:
         return []
     axes = " and ".join(direction for direction, sign in zip(DIRECTIONS, signs, strict=True) if sign < 0.0)
     text = (
-        f"'{name}' looks mirrored {axes} against 'before': {best:.0%} of the organs' voxels agree when it is flipped,"
-        f" {plain:.0%} as it is; check how the images were exported (RAS and LPS confused?)"
+        f"'{name}' looks mirrored {axes} against 'before': {best:.0%} of the tissues' voxels agree when it is flipped,"
+        f" {plain:.0%} as it is. Check how both images were exported; RAS and LPS may be confused."
     )
     if best - plain >= MIRROR_CERTAIN:
         raise InputDataError(text)
@@ -338,11 +345,11 @@ def _shifts(before: Segmentation, after: Segmentation, observed: Sequence[int], 
         length = float(np.linalg.norm(vector - common))
         share = FAR_SHARE.get(before.tissues[i].role, 1.0)
         if length > share * size:
-            against = "against the rigid tissues, " if rigid else ""
+            against = " relative to the rigid tissues" if rigid else ""
             text = (
-                f"'{before.tissues[i].name}' moves by {length:.1f} mm from 'before' to '{name}', {against}more than"
-                f" {'half of ' if share < 1.0 else ''}its size of {size:.1f} mm; check that its label means the same"
-                " organ, and that the images lie on each other"
+                f"'{before.tissues[i].name}' moves by {length:.1f} mm from 'before' to '{name}'{against}, more than"
+                f" {'half of ' if share < 1.0 else ''}its size of {size:.1f} mm. Check that its label means the same"
+                " tissue in both images, and that the images are aligned."
             )
             findings.append(Finding("large-shift", text, before.tissues[i].name, f"to '{name}' ({length:.1f} mm)"))
     return findings
@@ -355,22 +362,29 @@ def _volume_change(before: Segmentation, after: Segmentation, i: int, name: str)
         return []
     radii = [(0.75 * image.volume(i) / np.pi) ** (1.0 / 3.0) for image in (before, after)]  # of balls as large
     drawn, voxel = abs(radii[1] - radii[0]), float(after.grid.voxel_volume ** (1.0 / 3.0))
-    text = (
-        f"the volume of '{tissue.name}' changes by {change:+.1%} from 'before' ({before.volume(i) / 1000.0:.4g} mL) to"
-        f" '{name}' ({after.volume(i) / 1000.0:.4g} mL): either it is drawn otherwise, {drawn:.2g} mm"
-        f" ({drawn / voxel:.2g} voxels) further {'out' if change > 0.0 else 'in'} all round would do, or it filled or"
-        " emptied, which no modulus explains; compare the outlines, and give a hollow organ that fills the role driver"
+    sizes = (
+        f"The volume of '{tissue.name}' changes by {change:+.1%} from 'before' ({before.volume(i) / 1000.0:.4g} mL) to"
+        f" '{name}' ({after.volume(i) / 1000.0:.4g} mL)"
     )
     place = f"to '{name}' ({change:+.1%})"
     cut = [_touching(image.mask(i)) for image in (before, after)]
     if cut[1] and not cut[0]:
         return []  # the later image's field of view ends in the organ, and shows less of it
     if any(cut):
-        text += "; here the image's border cuts the organ, which may be the cause"
+        text = (
+            f"{sizes}; the image's border cuts it, which may be the cause. Use a larger field of view, if there is one."
+        )
         return [Finding("volume-change", text, tissue.name, place)]
+    alike = (
+        f"a surface drawn {drawn:.2g} mm ({drawn / voxel:.2g} voxels) further {'out' if change > 0.0 else 'in'} would"
+        " look the same"
+    )
+    driver = "if it is hollow and fills or empties, give it the role driver"
     if abs(change) > VOLUME_IMPLAUSIBLE:
-        text += "; so large a change is implausible for one organ: check that the label means the same in both images"
+        advice = f"Check that the label means the same in both images; {driver}."
+        text = f"{sizes}, too much for one organ; {alike}. {advice}"
         return [Finding("volume-implausible", text, tissue.name, place)]
+    text = f"{sizes}, which no modulus explains; {alike}. Compare the outlines; {driver}."
     return [Finding("volume-change", text, tissue.name, place)]
 
 
@@ -402,8 +416,8 @@ def _moving_void(before: Segmentation, after: Segmentation, i: int, name: str) -
     if motion <= VOID_STILL * STILL_VOXELS * voxel:
         return []
     text = (
-        f"'{tissue.name}' has the role void and lies inside the body, and its wall moves by {motion:.2g} mm from"
-        f" 'before' to '{name}': the model leaves it free, and explains what it pushes by the motion of others; give a"
-        " hollow organ that fills or moves the role driver"
+        f"The surface of '{tissue.name}' moves by {motion:.2g} mm from 'before' to '{name}', but the role void does not"
+        " prescribe that motion. If it is a hollow organ that fills or moves, give it the role driver; air that follows"
+        " its surroundings may stay void."
     )
     return [Finding("void-moves", text, tissue.name, f"to '{name}' ({motion:.2g} mm)")]

@@ -110,7 +110,7 @@ def distance_map(mask: NDArray[np.bool_], grid: VoxelGrid, *, smoothing_mm: floa
 
     Near the surface the probit of the smoothed indicator, d = -sigma Phi^-1(G_sigma * 1_mask), which is exact for a
     plane; far from it the Euclidean distance transform, blended over one sigma. `smoothing_mm` is sigma, mm. Without
-    `far` the map ends in planes of 2.5 sigma, for what is asked near the surface: a third of the price.
+    `far` the map ends in planes of 2.5 sigma, for what is asked near the surface: a third of the cost.
     """
     limit, size = PROBIT_LIMIT * smoothing_mm, float(np.linalg.norm(grid.spacing * grid.shape))
     values = np.full(mask.shape, size if far else limit)

@@ -116,7 +116,7 @@ def whole_input(path: Path, limit: int) -> tuple[bytes, str]:
     try:
         with open_input(path) as file:
             if file.n_bytes > limit:
-                raise InputDataError(f"'{path}' is larger than {limit} bytes; is it another file? Else make it smaller")
+                raise InputDataError(f"'{path}' is larger than {limit} bytes; check that it is the right file")
             content = file.read(limit)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -131,7 +131,9 @@ def beside(path: Path, name: str) -> Path:
     """
     target = followed(path.parent / name, path.parent)
     if target is None:
-        raise InputDataError(f"'{path}' names a file outside its own folder, which is not read; put both into one")
+        raise InputDataError(
+            f"'{path}' names a file outside its own folder, which is not read; put both into one folder"
+        )
     return target
 
 

@@ -73,7 +73,7 @@ class LabelImage:
         given = np.asarray(self.labels).dtype
         labels = np.array(self.labels, dtype=given if given in NARROW else np.int32)
         if labels.shape != self.grid.shape:
-            raise InputDataError(f"labels have the shape {labels.shape}, their grid {self.grid.shape}: they must agree")
+            raise InputDataError(f"labels of shape {labels.shape} do not fit the grid of shape {self.grid.shape}")
         labels.setflags(write=False)
         object.__setattr__(self, "labels", labels)
         object.__setattr__(self, "names", dict(self.names))

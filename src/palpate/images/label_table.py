@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.errors import InputDataError
-from palpate.findings import Finding
+from palpate.findings import Finding, listing
 from palpate.images.input_file import whole_input
 from palpate.images.named_labels import ROW, LabelTable, NamedLabel, checked_table, hex_colour, printable
 from palpate.images.named_labels import computed_by_spreadsheets as computed
@@ -36,7 +36,7 @@ MAX_LINE = 1000  # letters of a line, because patterns are tried from each of th
 ENDINGS = (".csv", ".ctbl", ".json", ".label", ".tsv", ".txt")
 COLOUR = re.compile(r"#[0-9a-f]{6}")
 COLUMNS = ("LabelValue", "Name", "Color_R", "Color_G", "Color_B", "Color_A")
-AS_NUMBERS = "write the numbers as the label of a tissue in the case"
+AS_NUMBERS = ". Write the numbers as the label of a tissue in the case."
 DIGITS = re.compile(r"[0-9]{1,9}")  # int() would also accept blanks, signs, 1_0 and digits of other scripts
 COLOURS = r"(?P<red>[0-9]{1,3})\s+(?P<green>[0-9]{1,3})\s+(?P<blue>[0-9]{1,3})"
 ITKSNAP_ROW = re.compile(r"(?P<label>[0-9]{1,9})\s+" + COLOURS + r'(?:\s+[0-9.eE+-]{1,20})*\s+"(?P<name>[^"]*)".*')
@@ -53,26 +53,31 @@ def read_label_table(path: Path | str) -> LabelTable:
     Raises `InputDataError` for a file that cannot be read, or a label or name that is impossible or stands for two.
     """
     path = Path(path)
-    ending, left = path.suffix.lower(), ""
+    ending, regions = path.suffix.lower(), list[str]()
     if ending not in ENDINGS:
         advice = f'the endings known are {", ".join(ENDINGS)}; write it as JSON, {{"1": "prostate"}}'
-        raise InputDataError(f"no reader for the label table '{path}': {advice}")
+        raise InputDataError(f"the label table '{path}' has an unknown ending; {advice}")
     content, sha256 = whole_input(path, MAX_BYTES)
     try:
         text = content.decode("utf-8-sig")
         if ending == ".json":
-            rows, left = _json_rows(text)
+            rows, regions = _json_rows(text)
         else:
             rows = (_column_rows if ending in (".csv", ".tsv") else _line_rows)(text)
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputDataError(f"the label table '{path}' is not UTF-8 text, or damaged ({error}); export it") from error
+        raise InputDataError(
+            f"the label table '{path}' is not UTF-8 text, or is damaged ({error}); export it again"
+        ) from error
     except ValueError as error:
         raise InputDataError(f"the label table '{path}' {error}; correct it") from error
-    left = f"the label table '{path}' has regions, which were left out: {left}; {AS_NUMBERS}" if left else ""
-    table = checked_table(rows, path)
+    table, left = checked_table(rows, path), listing("", regions, AS_NUMBERS)
     if not table:
-        raise InputDataError(f"the label table '{path}' names no label; {left or 'is it another file?'}")
-    return replace(table, sha256=sha256, findings=(Finding("names-left-out", left),) if left else ())
+        flaw = (
+            f"names no label with one number; its regions: {left}" if regions else "names no label; is it another file?"
+        )
+        raise InputDataError(f"the label table '{path}' {flaw}")
+    left = f"the label table '{path}' has names for several numbers, which were left out: {left}"
+    return replace(table, sha256=sha256, findings=(Finding("names-left-out", left),) if regions else ())
 
 
 def _column_rows(text: str) -> list[NamedLabel]:
@@ -145,8 +150,8 @@ def _labels_in(content: Any) -> _Pairs | None:
     return None
 
 
-def _json_rows(text: str) -> tuple[list[NamedLabel], str]:
-    """Rows of a JSON table, where a key given twice is seen, and the regions that are left out, in words."""
+def _json_rows(text: str) -> tuple[list[NamedLabel], list[str]]:
+    """Rows of a JSON table, where a key given twice is seen, and in words the regions that are left out."""
     try:
         content = json.loads(text, object_pairs_hook=_Pairs)
         pairs = _labels_in(content) or content
@@ -168,7 +173,7 @@ def _json_rows(text: str) -> tuple[list[NamedLabel], str]:
         numbers[name] = [int(number)]
     order = next((value for key, value in content if key == "regions_class_order"), None)
     left = _regions(numbers, order if isinstance(order, list) else [])
-    return [row for row in rows if row.name not in left], ", ".join(left.values())
+    return [row for row in rows if row.name not in left], [*left.values()]
 
 
 def _regions(numbers: Mapping[str, Sequence[int]], order: Sequence[Any]) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""How a later image lay when it was read: the rigid motion that was measured, and taken out of it."""
+"""The rigid motion of a later image that was measured and removed."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ ON = {"rigid-tissues": "the rigid tissues", "surfaces": "all surfaces that both 
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """The rigid motion from the first image's world to a later one's, and what was left of it.
+    """The rigid motion from the first image to a later one, and the distances that remain after it.
 
     by: "rigid-tissues" or "surfaces", on which it was measured; centre (3,) mm: that of the reference's organs, whose
-    motion is stated; residual_mm: robust root mean square of what the surfaces keep that it was measured on;
-    residual_by_tissue_mm: root mean square of each surface that both images show.
+    motion is stated; residual_mm: robust root mean square of the distance that remains between those surfaces;
+    residual_by_tissue_mm: root mean square for each surface that both images show.
     """
 
     by: str
@@ -51,21 +51,21 @@ class Registration:
 
     @property
     def still(self) -> bool:
-        """Whether the whole does not move, but for what rounding makes of nothing."""
+        """Whether the whole does not move, within rounding."""
         return self.distance_mm < ROUNDING and self.rotation_deg < ROUNDING
 
     @property
     def in_words(self) -> str:
-        """What goes on after the later image's name: where it lay, on what that was measured, what was done."""
+        """Where the later image lay, on what that was measured and what was done, to follow the image's name."""
         if self.still:
-            return f"is left where it lies: {ON[self.by]} show no clear motion of the whole"
+            return f"was not moved: {ON[self.by]} show no clear motion of the whole"
         return (
-            f"lay {self.distance_mm:.1f} mm and {self.rotation_deg:.1f} degrees elsewhere, measured on {ON[self.by]},"
-            f" and was brought back; these keep {length_text(self.residual_mm)} mm"
+            f"lay {self.distance_mm:.1f} mm and {self.rotation_deg:.1f} degrees away, measured on {ON[self.by]}, and"
+            f" was moved back; these surfaces then lie {length_text(self.residual_mm)} mm apart"
         )
 
     def own_motion_mm(self, tissues: Sequence[Tissue]) -> float:
-        """How far organs and drivers move against the whole, mm: root mean square of their surfaces' distances."""
+        """Motion of organs and drivers relative to the whole, mm: root mean square of their surfaces' distances."""
         moving = [tissue.name for tissue in tissues if tissue.role in (Role.ESTIMATE, Role.DRIVER)]
         kept = [mm for name, mm in self.residual_by_tissue_mm.items() if name in moving]
         return float(np.sqrt(np.mean(np.square(kept)))) if kept else 0.0
@@ -83,12 +83,12 @@ class Registration:
 
 
 def length_text(mm: float) -> str:
-    """A length as a person wants it: two digits, and nothing below a hundredth of a millimetre."""
+    """A length with two digits, and nothing below 0.01 mm."""
     return f"{mm:.2g}" if mm >= LEAST_MM else f"less than {LEAST_MM:g}"
 
 
 def registration(before: Segmentation, maps: SurfaceMaps, fit: RigidFit, *, by: str) -> Registration:
-    """What a measured motion does to the organs, and what it leaves of each surface.
+    """A measured motion of the organs, and the distance that remains at each surface.
 
     maps: as of `surface_maps`; by: "rigid-tissues" or "surfaces", on which it was measured.
     """

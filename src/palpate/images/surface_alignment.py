@@ -1,4 +1,4 @@
-"""Rigid motion between two images without bones: of all surfaces that both show, most of which nearly keep together."""
+"""Rigid motion between two images without bones, from all surfaces that both show."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def surface_maps(before: Segmentation, after: Segmentation) -> SurfaceMaps:
 
 
 def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
-    """The rigid motion before -> after that most surfaces agree on; none where that explains the images about as well.
+    """The rigid motion before -> after that most surfaces agree on, unless no motion explains the images as well.
 
     Most probable motion under r_i = phi_after(R x_i + t) - phi_before(x_i) ~ N(0, K) of points x_i of every tissue's
     surface: K is that of a smooth motion of the tissue's own, alike over 40 mm, of 1.5 mm (a driver: 4 mm), and 1 mm
@@ -128,8 +128,8 @@ def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
         middles.append((first.area @ first.places / first.area.sum(), second.area @ second.places / second.area.sum()))
     if not surfaces:
         raise InputDataError(
-            "no tissue shows enough of its surface in both images, away from their borders, for a motion between them"
-            " to be measured; enlarge the images, or set align = 'none'"
+            "no tissue shows enough of its surface in both images, away from their borders, to measure the motion"
+            " between them; use larger fields of view, or set align = 'none'"
         )
     centre = np.average([here for here, _ in middles], axis=0)
     shift = np.median([there - here for here, there in middles], axis=0)
@@ -139,8 +139,8 @@ def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
     found = [_descended(surfaces, centre, start) for start in starts if start.n_seen >= LEAST_POINTS]
     if not found:
         raise InputDataError(
-            f"under {LEAST_POINTS} surface points come to lie inside the later image: the images show different parts"
-            " of the body"
+            f"fewer than {LEAST_POINTS} surface points lie inside the later image, so the images show different parts"
+            " of the body; check both"
         )
     best = min(found, key=lambda trial: trial.misfit)
     if 2 * still.n_seen > best.n_seen:

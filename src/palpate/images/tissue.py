@@ -1,4 +1,4 @@
-"""Who is who: a tissue of the body, its labels, its role and its material constants."""
+"""A tissue of the body: its labels, its role and its material constants."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DARKEST = 64  # of the brightest channel of a tissue's own colour
 
 
 class Role(StrEnum):
-    """What a tissue does in the model; `SLIDING`: the body glides along it, which a mesh's surfaces alone can say."""
+    """The role of a tissue; the body slides along a `SLIDING` one, which only a surface of a mesh can be."""
 
     ESTIMATE = "estimate"
     KNOWN = "known"
@@ -30,7 +30,7 @@ class Role(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FieldPrior:
-    """What is believed of ln E inside a tissue whose modulus is a field.
+    """The prior of ln E inside a tissue whose modulus is a field.
 
     sd: standard deviation, dimensionless; length_mm: of its kernel, Matern's with one derivative, mm.
     total_variation: whether it is not Gaussian, but has its total variation, on the scale of both, for a prior: the
@@ -49,8 +49,8 @@ class Tissue:
 
     `labels` empty means "remaining": every voxel that no other tissue names.
     `youngs_modulus_kpa` is required for `known`, the truth of a simulation for `estimate`, else None.
-    `modulus_sd`: standard deviation of what is believed of ln E of a `known` tissue, dimensionless; 0: it is certain.
-    `field`: what is believed of ln E inside the tissue, where it is to be mapped.
+    `modulus_sd`: prior standard deviation of ln E of a `known` tissue, dimensionless; 0: it is certain.
+    `field`: the prior of ln E inside the tissue, if it is to be mapped.
     Where the image or its table has them, `colour`: #rrggbb, and `called`: the names of the labels there.
     """
 

@@ -69,7 +69,7 @@ def continued(
         except EstimationError as error:
             if len(ends) == 1:
                 raise
-            progress(f"another minimum is left out: {error}")
+            progress(f"another minimum was left out: {error}")
             outcome = Outcome.NO_EQUILIBRIUM if isinstance(error, NotConverged) else Outcome.NOT_FOLLOWED
             ends[-1] = replace(ends[-1], iterate=replace(near, minimum=replace(near.minimum, outcome=outcome)))
     return tuple(ends)
@@ -99,6 +99,7 @@ def ended(near: OuterIterate, bounds: Bounds, *, rule: StopRule, progress: Progr
             end = minimised(free, bounds, rule, progress=progress, title=title)
             end = end.at_equilibrium() if finite else end
     except EstimationError as error:
+        progress(f"{title}: {error}")
         return replace(fixed, released=free, unsettled=str(error))
     if not end.minimum.converged:
         return replace(fixed, released=free, unsettled=end.minimum.outcome.value)

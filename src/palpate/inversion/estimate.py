@@ -56,8 +56,8 @@ def invert(
     """
     if problem.finite_strain and problem.parameters.poisson:
         raise ConfigurationError(
-            "a Poisson's ratio can be sought under the linear law only: the finite-strain models hold those of the"
-            " tissues; seek none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
+            "a Poisson's ratio can be estimated under the linear law only, as finite-strain models keep those of the"
+            " tissues; estimate none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
         )
     bounds = settings.bounds
     minima, runs, rest = from_starts(problem, settings.centre, settings.every_start, bounds, progress=progress)

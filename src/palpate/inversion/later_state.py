@@ -79,7 +79,7 @@ class LaterState:
         Raises `ConfigurationError` while nothing stands in for the model.
         """
         if self.approximation is None:
-            raise ConfigurationError("this state has no approximation of its model yet: see `with_approximation`")
+            raise ConfigurationError("this state has no approximation of its model yet: call `with_approximation`")
         return self.approximation.model.solve(moduli, coefficients).displacement
 
 

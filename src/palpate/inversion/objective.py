@@ -217,12 +217,12 @@ class Objective:
         return points
 
     def under(self, approximations: Sequence[Approximation]) -> Objective:
-        """The same observations and weights with other approximations, one a state."""
+        """The same observations and weights with other approximations, one for each state."""
         pairs = zip(self.states, approximations, strict=True)
         return replace(self, states=tuple(state.with_approximation(model) for state, model in pairs))
 
     def bent_as(self, models: Sequence[Approximation]) -> Objective:
-        """The same with others in place of what it `bends_as`, one a state."""
+        """The same with others in place of what it `bends_as`, one for each state."""
         pairs = zip(self.states, models, strict=True)
         states = [replace(s, bending=model) if s.bending else s.with_approximation(model) for s, model in pairs]
         return replace(self, states=tuple(states))

@@ -37,13 +37,13 @@ class LeastSquares(Protocol):
 class Outcome(StrEnum):
     """How an iteration ended; the value is the sentence that the user reads."""
 
-    CONVERGED = "the decrement fell under its tolerance"
-    STEPS = "the iteration reached its largest number of steps; raise it, or start nearer"
-    STUCK = "no step reduced the objective; look at the fit of the driver's surface and at the images"
-    UNSOLVABLE = "every shorter step led where the model cannot be solved, as where it turns elements inside out"
+    CONVERGED = "the predicted decrease of the objective fell below its tolerance"
+    STEPS = "the iteration reached its largest number of steps"
+    STUCK = "no step reduced the objective; check the images and the fit of the driver's surface"
+    UNSOLVABLE = "every shorter step led to a state that cannot be solved, for example with elements inside out"
     NOT_FINITE = "the objective is not a finite number; check the images and the moduli's bounds"
     NO_EQUILIBRIUM = "the body has no equilibrium there under the material law"
-    NOT_FOLLOWED = "it could not be followed under the material law; log.txt says why"
+    NOT_FOLLOWED = "it could not be followed under the material law (log.txt says why)"
 
     @property
     def converged(self) -> bool:

@@ -43,11 +43,11 @@ TRIED = 4  # iterations after blocks have chosen anew, within which J must fall 
 
 
 class Criterion(StrEnum):
-    """What must hold for an estimate to end; the value is what the user reads where it does not."""
+    """Conditions of convergence; the value is what the user reads where one does not hold."""
 
-    STEP = "the estimate still moves"
-    LINEARISATION = "the estimate still moves where the model is linearised anew"
-    MODEL_ERROR = "the model that stands in for the full one is not exact enough where the estimate lies"
+    STEP = "the estimate still moves from iteration to iteration"
+    LINEARISATION = "the estimate still moves when the model is linearised again"
+    MODEL_ERROR = "the reduced model is not accurate enough at the estimate"
 
 
 @dataclass(frozen=True, slots=True)

@@ -96,7 +96,8 @@ class Conditions:
         given, n_dof = self.constraint, 3 * len(space.points)
         if given.free.shape[0] != n_dof or len(given.modes) != n_dof or len(given.offset) != n_dof:
             raise ConfigurationError(
-                f"the constraint has {given.free.shape[0]} unknowns and the space {n_dof}: make both of the same space"
+                f"the constraint has {given.free.shape[0]} unknowns and the space {n_dof}: make both from the same"
+                " space"
             )
 
     def require_same_free(self, other: Constraint) -> None:
@@ -104,6 +105,6 @@ class Conditions:
         free, theirs = self.constraint.free, other.free
         if free is not theirs and (free.shape != theirs.shape or abs(free - theirs).max() > 0.0):
             raise ConfigurationError(
-                f"the conditions free other displacements ({free.shape[1]}) than the model ({theirs.shape[1]}): make a"
-                " model of its own for them, with `linear_model` or `finite_strain_model`"
+                f"the conditions have other free displacements ({free.shape[1]}) than the model ({theirs.shape[1]}):"
+                " make a model of its own for them, with `linear_model` or `finite_strain_model`"
             )

@@ -107,7 +107,8 @@ def checked_coefficients(coefficients: ArrayLike, n_modes: int) -> NDArray[np.fl
     values = np.array(coefficients, dtype=float)
     if values.shape != (n_modes,) or not np.all(np.isfinite(values)):
         raise ConfigurationError(
-            f"mode coefficients have the shape {values.shape}; give {n_modes} finite numbers, one a boundary mode"
+            f"mode coefficients have the shape {values.shape}; give {n_modes} finite numbers, one for each boundary"
+            " mode"
         )
     values.setflags(write=False)
     return values
@@ -123,7 +124,9 @@ class DenseEquilibrium:
     def displacement(self) -> NDArray[np.float64]:
         """Displacement u (n_outputs / 3, 3) mm; raises `ConfigurationError` when the outputs are not whole points."""
         if len(self.values) % 3:
-            raise ConfigurationError(f"the model has {len(self.values)} outputs, not three a point: use `values`")
+            raise ConfigurationError(
+                f"the model has {len(self.values)} outputs, not three for each point: use `values`"
+            )
         return self.values.reshape(-1, 3)
 
     @property

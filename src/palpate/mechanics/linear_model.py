@@ -360,7 +360,7 @@ class LinearEquilibrium(DenseEquilibrium):
 
 
 def poisson_tangents(equilibrium: LinearEquilibrium, dilatation: Dilatation) -> NDArray[np.float64]:
-    """Columns du / d nu_r = -F K_ff^-1 F^T E_r dK_r/dnu u (n_dof, n_regions) mm, one a tissue.
+    """Columns du / d nu_r = -F K_ff^-1 F^T E_r dK_r/dnu u (n_dof, n_regions) mm, one for each tissue.
 
     dilatation: that with which the model was made. The tissues' Poisson's ratios are closed.
     """

@@ -52,8 +52,8 @@ class LinearisedSystem:
         share = float(np.linalg.norm(rhs - self.matrix @ solution) / (np.linalg.norm(rhs) or 1.0))
         if not share <= max(ACCEPTED, tolerance):
             raise SolverError(
-                f"GMRES stopped at a relative residual of {share:.2g} in {n} unknowns: the loads that follow the body"
-                " are too large for its stiffness"
+                f"GMRES stopped at a relative residual of {share:.2g} in {n} unknowns: the loads that follow the"
+                " surface are too large for the body's stiffness; make them smaller"
             )
         return np.asarray(solution)
 

@@ -131,8 +131,8 @@ def gravity(space: LagrangeSpace, densities: Array, acceleration: Array) -> Dead
     mass = _refuse_infinite("density", np.asarray(densities, dtype=float))
     if mass.shape != (len(space.mesh.tissues),) or np.any(mass < 0.0):
         raise ConfigurationError(
-            f"densities are {mass.tolist()} kg/m^3; give {len(space.mesh.tissues)} numbers, none of them negative, one"
-            f" a tissue of {[tissue.name for tissue in space.mesh.tissues]}"
+            f"densities are {mass.tolist()} kg/m^3; give {len(space.mesh.tissues)} non-negative numbers, one for each"
+            f" tissue of {[tissue.name for tissue in space.mesh.tissues]}"
         )
     points, weights = quadrature(2)
     shares = weights @ shape_functions(space.order, points)

@@ -48,8 +48,8 @@ class SurfaceReaction:
         if smallest <= 0.0:
             raise SolverError(
                 f"the force on the surface around {np.round(self.centre, 1).tolist()} mm (RAS) has no value: the motion"
-                f" turns elements there inside out (volume ratio {smallest:.3g}), for which the"
-                f" {self.model.elements.law.name} law has no stress; look at what was measured there, and its direction"
+                f" turns elements there inside out (volume ratio {smallest:.3g}), where the"
+                f" {self.model.elements.law.name} law has no stress; check the measurement there and its direction"
             )
         by_region = self.virtual @ balance.region_forces(whole, balance.moduli)
         by_displacement = np.asarray(balance.stiffness(whole).T @ self.virtual)[self.dofs]

@@ -55,6 +55,6 @@ def unloaded_displacement(
             reason = f"its steps grow, the last one to {step:.3g} mm"
             break
     raise NotConverged(
-        f"the state without the loads of the reference was not found at moduli of {np.round(moduli, 3).tolist()} kPa:"
-        f" {reason}; check loads, densities and units, or state the increment of loads instead"
+        f"the stress-free state of the reference was not found at moduli of {np.round(moduli, 3).tolist()} kPa:"
+        f" {reason}; check loads, densities and units, or state only the change of the loads"
     )

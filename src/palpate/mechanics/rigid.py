@@ -54,7 +54,7 @@ def refuse_floating(space: LagrangeSpace, free: sparse.csr_matrix[np.float64], h
             centre = np.round(space.points[points].mean(axis=0), 1).tolist()
             by_cut = "outer_boundary = 'fixed', with " if holdable[points].any() else ""
             raise GeometryError(
-                f"the body floats: a part of {len(points)} points around {centre} mm (RAS) has no support against"
+                f"the body floats: a part of {len(points)} points around {centre} mm (RAS) is not held against"
                 f" {', '.join(loose)}; hold it with {by_cut}a `rigid` or `driver` tissue or a held surface of its mesh,"
                 " or remove it from the labels"
             )

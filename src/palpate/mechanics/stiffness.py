@@ -116,7 +116,7 @@ def checked_gradients(
         worst = int(np.flatnonzero(flat)[0])
         raise GeometryError(
             f"{int(flat.sum())} tetrahedra have no positive volume, the first is number {worst}"
-            f" ({mesh.volumes[worst]:.3g} mm^3): repair the mesh or make it anew with another edge length"
+            f" ({mesh.volumes[worst]:.3g} mm^3): repair the mesh, or make a new one with another edge length"
         )
     return barycentric_gradients(mesh.nodes, mesh.tets[inside])
 

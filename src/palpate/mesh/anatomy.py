@@ -69,7 +69,7 @@ class Box:
             raise GeometryError(f"the axes {self.axes.tolist()} of a box must be three orthogonal unit vectors in rows")
         if not (self.lengths > 0.0).all():
             raise GeometryError(
-                f"a box of {np.round(self.lengths, 1).tolist()} mm is empty: do the images show the same place?"
+                f"a box of {np.round(self.lengths, 1).tolist()} mm is empty; check that the images show the same place"
             )
 
     @property
@@ -111,7 +111,8 @@ class Anatomy:
         fillers = [tissue.name for tissue, phi in zip(self.tissues, self.level_sets, strict=True) if phi is None]
         if len(fillers) != 1:
             raise GeometryError(
-                f"an anatomy needs exactly one tissue without a level set, to fill what the others leave; got {fillers}"
+                "an anatomy needs exactly one tissue without a level set, to fill the space that the others leave; got"
+                f" {fillers}"
             )
 
     @property

@@ -65,12 +65,12 @@ def read_mesh_file(path: Path, *, data: str | None = None) -> MeshFile:
             read = replace(read, points=read.points * LPS_TO_RAS)
         return _sound(read, digest)
     except InputDataError as error:
-        raise InputDataError(f"'{path}' is no mesh that is read: {error}") from error
+        raise InputDataError(f"the mesh '{path}' cannot be read: {error}") from error
     except ConfigurationError:
         raise
     except Exception as error:  # libraries raise what they like
         raise InputDataError(
-            f"'{path}' is no mesh that is read: {type(error).__name__} {printable(str(error))[:200]}; export it as .msh"
+            f"the mesh '{path}' cannot be read: {type(error).__name__} {printable(str(error))[:200]}; export it as .msh"
             " of version 4.1, or as plain .vtu"
         ) from error
 
@@ -80,13 +80,15 @@ def _sound(read: Elements, digest: str) -> MeshFile:
     count = sum((Counter({kind: len(rows)}) for kind, rows, _ in read.blocks), Counter[str]())
     (tets, groups), (triangles, shown), (points, sets) = (_once(read, corners) for corners in (4, 3, 1))
     if not len(tets):
-        raise InputDataError(f"it holds {dict(count)} and no tetrahedra; export a volume mesh of 4 or 10 nodes a cell")
+        raise InputDataError(
+            f"it holds {dict(count)} but no tetrahedra; export a volume mesh with 4 or 10 nodes in each cell"
+        )
     if others := [f"{n} {kind}" for kind, n in count.items() if kind not in CORNERS and not kind.startswith(HOLLOW)]:
         also = ", ".join(others)
         raise InputDataError(f"beside {len(tets)} tetrahedra it has {also}: split these into tetrahedra")
     corners = np.concatenate([tets.ravel(), triangles.ravel(), points.ravel()])
     if corners.min() < 0 or corners.max() >= len(read.points) or read.points.shape[1] != 3:
-        raise InputDataError(f"its elements name nodes that it has not ({len(read.points)} nodes); export it again")
+        raise InputDataError(f"its elements name nodes that do not exist ({len(read.points)} nodes); export it again")
     used, places = np.unique(tets, return_inverse=True)
     new = np.full(len(read.points), -1)
     new[used] = np.arange(len(used))
@@ -117,26 +119,26 @@ def _once(read: Elements, corners: int) -> tuple[Numbers, dict[Name, Numbers]]:
 def _oriented(nodes: NDArray[np.float64], tets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Tetrahedra of positive volume, and the piece of each; `InputDataError` for flat ones, cracks and overlaps."""
     if not np.isfinite(nodes).all():
-        raise InputDataError("a node has a coordinate that is no number; export it again")
+        raise InputDataError("a node has a coordinate that is not a finite number; export it again")
     corners = nodes[tets]
     volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
     edges = np.linalg.norm(corners[:, FACE_PAIRS[:, 0]] - corners[:, FACE_PAIRS[:, 1]], axis=2)
     flat = np.abs(volumes) <= SLIVER * edges.max(axis=1) ** 3
     if flat.any():
         where = _place(corners[flat].mean(axis=1))
-        raise InputDataError(f"{flat.sum()} of its tetrahedra have no volume, the first {where}; mend it (Mmg, gmsh)")
+        raise InputDataError(f"{flat.sum()} of its tetrahedra have no volume, the first {where}; repair it (Mmg, gmsh)")
     shortest = np.full(len(nodes), np.inf)
     np.minimum.at(shortest, tets, edges.min(axis=1)[:, None])
     near = np.asarray(cKDTree(nodes).query(nodes, k=2)[0])[:, 1]
     apart = near < JOINED * shortest
     if apart.any():
         raise InputDataError(
-            f"{apart.sum()} of its nodes lie on another one that they are not joined to, as at a crack, the first"
+            f"{apart.sum()} of its nodes lie on another node without being joined to it, as at a crack, the first"
             f" {_place(nodes[apart])}, {near[apart][0]:.2g} mm apart; merge such nodes (gmsh: Coherence Mesh)"
         )
     piece, with_face = face_pieces(tets)
     if over := np.count_nonzero(with_face > 2):
-        raise InputDataError(f"{over} faces belong to over two tetrahedra, which overlap: mesh it anew")
+        raise InputDataError(f"{over} faces belong to more than two tetrahedra, which overlap; make a new mesh")
     return np.where(volumes[:, None] < 0.0, tets[:, [0, 2, 1, 3]], tets), piece
 
 

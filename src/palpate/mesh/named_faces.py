@@ -32,8 +32,8 @@ def plane_faces(
     lean = float(np.degrees(np.arccos(min(area[axis] / max(float(np.linalg.norm(area)), 1e-300), 1.0))))
     if found.any() and lean > LEANS_DEG:
         raise GeometryError(
-            f"the faces within {within_mm:g} mm of {plane} lean against that plane by {lean:.0f} degrees; name the"
-            " surface by a group of faces"
+            f"the faces within {within_mm:g} mm of {plane} are tilted against that plane by {lean:.0f} degrees; name"
+            " the surface by a group of faces"
         )
     return found
 
@@ -47,9 +47,9 @@ def listed_faces(faces: NDArray[np.int64], triangles: NDArray[np.int64], name: s
     found = np.isin(number[: len(faces)], number[len(faces) :])
     if np.count_nonzero(found) < len(triangles):
         raise GeometryError(
-            f"the group '{name}' has triangles that are no faces of the mesh's boundary, beside {found.sum()} that are:"
-            " they lie inside, between two tetrahedra, or are faces of none; name a group of outer faces alone, or save"
-            " the volume beside them, too (gmsh: in a physical group of its own)"
+            f"the group '{name}' has triangles that are not faces of the mesh's boundary, beside {found.sum()} that"
+            " are: they lie inside, between two tetrahedra, or belong to none; name a group of outer faces only, or"
+            " save the volume beside them too (gmsh: in a physical group)"
         )
     return np.asarray(found)
 
@@ -73,11 +73,11 @@ def tissues_behind(
             raise GeometryError(f"the surface '{name}' has no face of the boundary; make within_mm larger")
         if number not in own:
             raise GeometryError(
-                f"all faces of the surface '{name}' belong to surfaces that are named before it; name it first"
+                f"all faces of the surface '{name}' belong to surfaces that the case names before it; name it first"
             )
         if name in shared and not free[number] and len(lost):
             raise GeometryError(
-                f"{len(lost)} of the {len(own)} faces of the surface '{name}' would be free, as they belong to"
+                f"{len(lost)} of the {len(own)} faces of the surface '{name}' would stay free, because they belong to"
                 f" '{names[int(lost[0])]}', which is named before it; name '{name}' first"
             )
     return behind

@@ -158,7 +158,7 @@ def check_mesh(
                     f" volume of its {of} (limit {100 * limit:g} %){where}"
                 )
     if failures:
-        raise MeshQualityError(f"the mesh of {quality.tets} tetrahedra does not pass its gate: {'; '.join(failures)}")
+        raise MeshQualityError(f"the mesh of {quality.tets} tetrahedra fails its quality check: {'; '.join(failures)}")
     return quality
 
 
@@ -258,7 +258,7 @@ def _shape_failures(quality: MeshQuality, mesh: TetMesh, grid: VoxelGrid | None)
         piece, _ = face_pieces(mesh.tets)
         loose = piece != np.bincount(piece).argmax()
         failures.append(
-            f"it falls into {quality.components} pieces that share no face, one of them {_around(mesh, loose, grid)}"
+            f"it has {quality.components} pieces that share no face, one of them {_around(mesh, loose, grid)}"
         )
     if quality.overfull_faces:
         _, number, count = np.unique(

@@ -94,8 +94,8 @@ def remeshed(grid: Grid, sizes: NDArray[np.float64], *, box: Box, sag_mm: float)
         mesh["metric"] = sizes[:, None]
     except RuntimeError as error:
         raise ResourceError(
-            f"the mesher has no memory for {n_tets} tetrahedra ({error}); make mesh.edge_length_mm larger, or end other"
-            " programs"
+            f"the mesher has too little memory for {n_tets} tetrahedra ({error}); make mesh.edge_length_mm larger, or"
+            " end other programs"
         ) from error
     try:
         with interrupts_held(), _silent():

@@ -50,7 +50,7 @@ class Union:
 class Contacts:
     """Which surfaces the nodes of a grid lie on.
 
-    level_sets: one a surface; faces (n_faces, 3) node numbers and surface (n_faces,) their surface;
+    level_sets: one for each surface; faces (n_faces, 3) node numbers and surface (n_faces,) their surface;
     on (n_nodes, n_surfaces) whether a node is on a surface; target (n_nodes, n_surfaces) mm, the level set's value that
     the node is to have: zero, or what makes the facets around it unbiased.
     """
@@ -94,7 +94,7 @@ class Contacts:
 def contacts_of(grid: Grid, anatomy: Anatomy) -> Contacts:
     """The surfaces of `anatomy` in a grid of its meshed tissues.
 
-    All hollow tissues are one surface, the first; then one a meshed tissue, in the order of priority. A face belongs
+    All hollow tissues are one surface, the first; then one per meshed tissue, in the order of priority. A face belongs
     to the tissue on its two sides that wins. The faces of the box belong to none.
     """
     hollow = tuple(

@@ -42,7 +42,7 @@ class TetMesh:
         if len(self.region) != len(self.tets) or len(self.beyond) != len(self.boundary):
             raise GeometryError(
                 f"{len(self.tets)} tetrahedra with {len(self.region)} regions and {len(self.boundary)} boundary faces"
-                f" with {len(self.beyond)} neighbours: give one region a tetrahedron and one neighbour a face"
+                f" with {len(self.beyond)} neighbours: each tetrahedron needs one region, and each face one neighbour"
             )
 
         for what, numbers, low, count in (
@@ -53,7 +53,7 @@ class TetMesh:
         ):
             if numbers.size and not low <= int(numbers.min()) <= int(numbers.max()) < count:
                 raise GeometryError(
-                    f"{what} between {numbers.min()} and {numbers.max()}, and only {low} to {count - 1} are there"
+                    f"{what} between {numbers.min()} and {numbers.max()}, but only {low} to {count - 1} exist"
                 )
 
     @property

@@ -50,7 +50,8 @@ def voxelise(
     """
     if displacement.shape != space.points.shape:
         raise GeometryError(
-            f"the displacement has the shape {displacement.shape}, the space {space.points.shape}: give one row a point"
+            f"the displacement has the shape {displacement.shape}, the space {space.points.shape}: give one row for"
+            " each point"
         )
     faces = []  # between regions, each once, normals out of `inner` (n,) into `other` (n,)
     for region in np.unique(space.mesh.region):
@@ -161,7 +162,7 @@ def _accumulate(pieces: NDArray[np.float64], step: NDArray[np.int64], grid: Voxe
     jumps = np.bincount(flat, weights=signed[hit], minlength=nx * ny * (nz + 1))
     total = np.cumsum(jumps.astype(np.int64).reshape(nx, ny, nz + 1), axis=2)
     if total[:, :, nz].any():
-        raise GeometryError(f"{np.count_nonzero(total[:, :, nz])} voxel columns enter a region and never leave it")
+        raise GeometryError(f"{np.count_nonzero(total[:, :, nz])} voxel columns enter a region but never leave it")
     return total[:, :, :nz]
 
 

@@ -49,18 +49,19 @@ def read_displacement_field(file: DataFile) -> DisplacementField:
     """
     path = file.paths[0]
     if len(file.paths) != 1:
-        raise InputDataError(f"a displacement field is one file; {len(file.paths)} are named; leave out file_after")
+        raise InputDataError(f"a displacement field is one file, but {len(file.paths)} are named; remove file_after")
     if path.suffix.lower() == ".csv":
         table = read_point_table(path)
         if len(table.before) < FEWEST:
             raise InputDataError(
-                f"'{path}' holds {len(table.before)} of the {FEWEST} points or more of a field; state them as landmarks"
+                f"'{path}' holds {len(table.before)} points, and a field needs at least {FEWEST}; give them as"
+                " landmarks"
             )
         return DisplacementField(file, table)
     vectors, grid, digests = read_field(path, file.axes)
     given = np.isfinite(vectors).all(axis=-1) & vectors.any(axis=-1)
     if not given.any():
-        raise InputDataError(f"'{path}' holds no vector but zeros; give a field that moves something")
+        raise InputDataError(f"'{path}' holds only zero vectors; give a field with a motion")
     before = grid.world(np.argwhere(given).astype(np.float64))
     table = PointTable(before, before + vectors[given], ("",) * len(before), digests)
     return DisplacementField(file, checked_table(table, path))

@@ -42,7 +42,9 @@ def read_field(path: Path, axes: str) -> Field:
     """
     reader = next((read for ending, read in READERS.items() if path.name.lower().endswith(ending)), None)
     if reader is None:
-        raise InputDataError(f"'{path}' is no kind of field that is read; export one of .csv, {', '.join(READERS)}")
+        raise InputDataError(
+            f"'{path}' has an ending that is not read as a field; export it as .csv, {', '.join(READERS)}"
+        )
     try:
         return reader(path, axes)
     except ImportError as error:
@@ -57,7 +59,8 @@ def _signs(told: str, axes: str, path: Path) -> NDArray[np.float64]:
     """The signs that turn vectors to RAS, by the file's axes ("": none) and those that the case states."""
     if told and axes not in ("", told):
         raise InputDataError(
-            f"the vectors of '{path}' are in {told}, as it says, not in {axes}, as the case states; take the key out"
+            f"the vectors of '{path}' are in {told}, by its header, but the case states {axes}; remove the key axes"
+            " from [[data]]"
         )
     if not told and not axes:
         raise InputDataError(
@@ -153,7 +156,8 @@ def _transform(path: Path, axes: str) -> Field:
     }
     if not images:
         raise InputDataError(
-            f"'{path}' holds no displacement field, or an inverted one; write it as a field on the first image's grid"
+            f"'{path}' holds no displacement field, or an inverted one; write it as a field on the grid of the first"
+            " image"
         )
     finest = min(reversed(images.values()), key=lambda image: float(np.prod(image.GetSpacing())))
     _refuse_many(finest.GetSize(), path)
@@ -165,7 +169,8 @@ def _transform(path: Path, axes: str) -> Field:
         whole[~inside] = np.nan
     if np.isnan(whole).all():
         raise InputDataError(
-            f"the {len(images)} fields of '{path}' have grids that no way keeps to; write the transform as one field"
+            f"the {len(images)} fields of '{path}' have grids that do not fit together; write the transform as one"
+            " field"
         )
     turn = np.diag([*(signs * LPS_TO_RAS), 1.0])
     return whole * signs, VoxelGrid(grid.shape, turn @ grid.affine), tuple(digests)

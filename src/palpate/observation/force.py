@@ -67,7 +67,7 @@ class Force(StatedNoise):
     @property
     def _known(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if self.at is None:
-            raise ConfigurationError(f"the {self.name} depends on the moduli: ask for its residuals `under` some")
+            raise ConfigurationError(f"the {self.name} depends on the moduli: use its residuals `under` given moduli")
         return self.at
 
 

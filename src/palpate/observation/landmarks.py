@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError
-from palpate.findings import Finding
+from palpate.findings import Finding, listing
 from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.named_labels import printable
 from palpate.observation.contract import DataFile
@@ -23,7 +23,7 @@ from palpate.observation.measured_points import MeasuredPoints, PointTable, chec
 Marks = list[tuple[str, NDArray[np.float64]]]  # labels and points, RAS mm, NaN of one that was not placed
 TO_RAS = {"LPS": LPS_TO_RAS, "RAS": np.ones(3), "1": LPS_TO_RAS, "0": np.ones(3)}
 NOWHERE = (np.nan, np.nan, np.nan)
-MOST_NAMED = 8  # points, by name
+OUTSIDE = ". Check that they are points of the body that was meshed."
 PLACED = ("2", "")  # behind the columns that a .fcsv of 3D Slicer 5 names: 0 undefined, 1 preview, 3 missing
 
 
@@ -38,10 +38,9 @@ class Landmarks(MeasuredPoints):
         names = np.array([name or f"number {number}" for number, name in enumerate(self.table.names, start=1)])
         if inside.all():
             return tuple(names.tolist()), self.table.pairing
-        text = (
-            f"{np.count_nonzero(~inside)} of {len(inside)} landmarks of '{self.file.paths[0].name}' lie outside of the"
-            f" meshed body and are left out: {_shown(names[~inside].tolist())}"
-        )
+        count, name = np.count_nonzero(~inside), self.file.paths[0].name
+        lead = f"{count} of {len(inside)} landmarks of '{name}' lie outside the mesh and are left out: "
+        text = listing(lead, _quoted(names[~inside].tolist()), OUTSIDE)
         outside = Finding("points-outside", text, place=f"in state {self.file.state}")
         return tuple(names[inside].tolist()), (*self.table.pairing, outside)
 
@@ -72,7 +71,8 @@ def read_landmarks(file: DataFile) -> Landmarks:
         for labels, used in zip((first, second), pairs.T, strict=True)
         for n in np.setdiff1d(np.arange(len(labels)), used)
     )
-    text = f"{len(left)} landmarks of {where} are not placed in both lists, and are left out: {_shown(list(left))}"
+    lead = f"{len(left)} landmarks of {where} are not placed in both lists and are left out: "
+    text = listing(lead, _quoted(list(left)), ". Place them in both lists, with the same label.")
     findings = (Finding("points-unpaired", text, place=f"in state {file.state}"),) if left else ()
     names = tuple(first[n] for n in pairs[:, 0])
     table = PointTable(before[pairs[:, 0]], after[pairs[:, 1]], names, tuple(digests), findings)
@@ -98,7 +98,8 @@ def _pairs(first: Sequence[str], second: Sequence[str], where: str) -> list[tupl
         most = max(most, len(both))
     if most or len(first) != len(second):
         raise InputDataError(
-            f"{where} hold {len(first)} and {len(second)} points, {most} of one label; give each pair the same label"
+            f"{where} hold {len(first)} and {len(second)} points, of which {most} have the same label; label both"
+            " points of each pair alike"
         )
     return [(n, n) for n in range(len(first))]
 
@@ -111,7 +112,9 @@ def _markups(content: str, path: Path) -> list[Marks]:
             system = str(markup.get("coordinateSystem", "LPS")).upper()
             units = markup.get("coordinateUnits", "mm")  # a word, or a list of a code, its scheme and its meaning
             if system not in TO_RAS or (units[0] if isinstance(units, list) else units) != "mm":
-                raise InputDataError(f"'{path}' is in {system[:20]!r}, {str(units)[:20]!r}; export LPS or RAS in mm")
+                raise InputDataError(
+                    f"'{path}' is in {system[:20]!r} and {str(units)[:20]!r}; export it in LPS or RAS, in mm"
+                )
             points = []
             for point in markup["controlPoints"]:
                 placed = point.get("positionStatus", "defined") == "defined" and point.get("position") is not None
@@ -121,7 +124,7 @@ def _markups(content: str, path: Path) -> list[Marks]:
     except (ValueError, RecursionError, LookupError, TypeError, AttributeError) as error:
         raise InputDataError(
             f"'{path}' is no markups file of 3D Slicer ({type(error).__name__}: {error}); landmarks are read from"
-            " .mrk.json and .fcsv, or from one .csv that has both points of each in a line (before_x ... after_z)"
+            " .mrk.json and .fcsv, or from one .csv with both points of a pair in each line (before_x ... after_z)"
         ) from error
     return lists
 
@@ -142,9 +145,9 @@ def _fcsv(content: str, path: Path) -> list[Marks]:
             position = [float(row[axis]) for axis in "xyz"] if placed else NOWHERE
             points.append((printable(row.get("label", "").strip()[:200]), TO_RAS[system] * position))
     except (KeyError, ValueError, csv.Error) as error:
-        raise InputDataError(f"a line of '{path}' holds no point ({error}); export it again") from error
+        raise InputDataError(f"'{path}' has a line that is not a point ({error}); export it again") from error
     return [points]
 
 
-def _shown(names: Sequence[str]) -> str:
-    return ", ".join(names[:MOST_NAMED]) + (" ..." if len(names) > MOST_NAMED else "")
+def _quoted(names: Sequence[str]) -> list[str]:
+    return [f"'{name}'" for name in names]

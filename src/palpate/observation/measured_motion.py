@@ -65,7 +65,8 @@ class MeasuredMotion:
         if n < FEWEST or far:
             place = np.round(points[int(np.argmax(distance))], 1).tolist()
             raise InputDataError(
-                f"'{name}' is prescribed by {n} measured points, and {far} of its {len(points)} nodes lie further than"
-                f" {self.kernel_mm:g} mm ([driver] kernel_mm) from all, the farthest at {place} mm; measure {FEWEST}"
-                ' points or more beside it, or give it the boundary "moving"'
+                f"'{name}' is prescribed by {n} measured points, and {far} of its {len(points)} nodes lie more than"
+                f" {self.kernel_mm:g} mm ([driver] kernel_mm) from all of them, the farthest at {place} mm; measure at"
+                f" least {FEWEST} points"
+                ' near it, or give it the boundary "moving"'
             )

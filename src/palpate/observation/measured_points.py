@@ -119,8 +119,8 @@ class MeasuredPoints:
         plain, (words, best) = next(iter(agreement.values())), max(agreement.items(), key=lambda found: found[1])
         if best > plain + CLEARLY:
             raise InputDataError(
-                f"the displacements of '{self.file.paths[0]}' bring {plain:.0%} of the points that change their place"
-                f" into their own tissue, and would bring {best:.0%} if they led {words}"
+                f"the displacements of '{self.file.paths[0]}' bring {plain:.0%} of the moved points into their own"
+                f" tissue, but would bring {best:.0%} if they led {words}"
             )
 
     def on(self, space: LagrangeSpace, reaction_of: ReactionOf) -> tuple[PointDisplacement, tuple[Finding, ...]]:
@@ -148,7 +148,9 @@ def read_point_table(path: Path) -> PointTable:
             rows.append([float(line[name] or "nan") for name in COLUMNS])
             labels.append(printable((line.get("label") or "").strip()[:200]))
     except (TypeError, ValueError, csv.Error) as error:
-        raise InputDataError(f"line {lines.line_num} of '{path}' holds no six numbers ({error}); correct it") from error
+        raise InputDataError(
+            f"line {lines.line_num} of '{path}' does not hold six numbers ({error}); correct it"
+        ) from error
     values = np.array(rows, dtype=np.float64).reshape(-1, 2, 3)
     return checked_table(PointTable(values[:, 0], values[:, 1], tuple(labels), (digest,)), path)
 
@@ -159,7 +161,7 @@ def read_text(path: Path) -> tuple[str, str]:
     try:
         return content.decode("utf-8-sig"), digest
     except UnicodeDecodeError as error:
-        raise InputDataError(f"'{path}' is not UTF-8 text ({error}); export it as such") from error
+        raise InputDataError(f"'{path}' is not UTF-8 text ({error}); export it as UTF-8") from error
 
 
 def checked_table(table: PointTable, path: Path) -> PointTable:
@@ -169,18 +171,19 @@ def checked_table(table: PointTable, path: Path) -> PointTable:
     bad = np.flatnonzero(~(np.abs(np.concatenate([table.before, table.after], axis=1)) < FARTHEST).all(axis=1))
     if len(bad):
         raise InputDataError(
-            f"{len(bad)} pairs of '{path}', the first {bad[0] + 1}, have absurd coordinates or no number; take them out"
+            f"{len(bad)} pairs of '{path}', the first {bad[0] + 1}, have no number, or coordinates beyond any body;"
+            " remove them"
         )
     if np.array_equal(table.before, table.after):
-        raise InputDataError(f"the points of '{path}' lie where they lay before, to the last digit; give later ones")
+        raise InputDataError(f"the points of '{path}' did not move at all; give those of a later state")
     step = -(-len(table.before) // MOST_POINTS)
     points, moved = (values[::step] - values.mean(axis=0) for values in (table.before, table.moved))
     slopes = np.linalg.lstsq(points, moved, rcond=FLAT)[0]  # 0 across points that lie in a plane
     least = float(np.linalg.svd(slopes)[1][-1])
     if len(points) >= SEVERAL and least > STRETCH:  # a rotation leaves its axis where it is
         raise InputDataError(
-            f"the displacements of '{path}' change by {least:.2g} mm a mm or more in every direction, as no body's do:"
-            " they are positions in place of displacements, in another unit, or of other points; correct the file"
+            f"the displacements of '{path}' change by {least:.2g} mm per mm or more in every direction, which is"
+            " impossible for a body: they may be positions, in another unit, or of other points; correct the file"
         )
     return table
 
@@ -198,7 +201,7 @@ def _refuse_slips(mesh: TetMesh, points: NDArray[np.float64], inside: NDArray[np
     if not inside.any():
         low, high = points.min(axis=0).round(1).tolist(), points.max(axis=0).round(1).tolist()
         raise InputDataError(
-            f"no point of '{path}' lies in the mesh: they span {low} to {high} mm (RAS); give this patient's"
+            f"no point of '{path}' lies in the mesh: they span {low} to {high} mm (RAS); give those of this body"
         )
 
 

@@ -64,8 +64,8 @@ def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
     surface, name = tissue_surface(mesh, tissue), mesh.tissues[tissue].name
     if not len(surface.triangles):
         raise GeometryError(
-            f"nothing of '{name}' is left in the mesh: it is so thin that the smoothing of the images' voxels takes it"
-            " away; use finer images, or join it to its neighbour"
+            f"'{name}' is so thin that smoothing the voxels removes it from the mesh; use finer images, or join it to"
+            " its neighbour"
         )
     driver = mesh.tissues[tissue].role is Role.DRIVER  # all of its wall is seen: it is itself an unknown
     prescribed = [i for i, other in enumerate(mesh.tissues) if other.role in (Role.DRIVER, Role.RIGID)]
@@ -80,8 +80,8 @@ def observed_surface(space: LagrangeSpace, tissue: int) -> ObservedSurface:
     share = float(area[observed].sum() / area.sum())
     if share < MIN_SHARE:
         raise GeometryError(
-            f"'{name}': only {100 * share:.0f} % of its surface is free of drivers, bones and the image's border, so"
-            " its modulus cannot be observed; enlarge the image, or make the tissue `known`"
+            f"'{name}': only {100 * share:.0f} % of its surface is free of drivers, bones and the image's border, too"
+            " little to estimate its modulus; use a larger field of view, or make the tissue `known`"
         )
     faces = np.searchsorted(points, facets if space.order == 2 else np.zeros((0, 6), dtype=np.int64))
     # edges (n_triangles, 3), each opposite its corner, that belong to a single observed triangle

@@ -128,7 +128,7 @@ class SurfaceDistance:
         if not held.kept.any() or not held.of_model(self.target.area).any():
             raise EstimationError(
                 f"'{self.name}': none of the {len(held.kept)} points of its surface in the later image faces the"
-                " observed part of the model; is it the same organ, and do the images lie on each other?"
+                " observed part of the model; check that it is the same organ, and that the images are aligned"
             )
         return replace(self, held=held)
 

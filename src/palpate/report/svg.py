@@ -9,11 +9,12 @@ from functools import cache
 
 import jinja2
 import matplotlib as mpl
-from markupsafe import escape
+from markupsafe import Markup, escape
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+from palpate.findings import CODES, help_on
 from palpate.images.registration import length_text
 from palpate.report.rows import interval_text, number
 from palpate.report.ticks import MOST, log_marks, mark_text
@@ -48,9 +49,15 @@ def template_of(name: str, package: str = "palpate.report") -> jinja2.Template:
     """A page's template, of that package or ours, all that is put into it escaped; a quarter of a page's time."""
     loader = jinja2.ChoiceLoader([jinja2.PackageLoader(package), jinja2.PackageLoader("palpate.report")])
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.filters |= {"number": number, "length_text": length_text}
+    environment.filters |= {"number": number, "length_text": length_text, "code_link": code_link}
     environment.filters["interval"] = lambda ends: interval_text(None if ends is None else tuple(ends))
     return environment.get_template(name)
+
+
+def code_link(code: str) -> Markup:
+    """The code of a warning as HTML, with a link to its explanation where there is one."""
+    name = Markup("<code>{}</code>").format(code)
+    return Markup('<a href="{}" rel="noreferrer">{}</a>').format(help_on(code), name) if code in CODES else name
 
 
 def link_url(number: int) -> str:

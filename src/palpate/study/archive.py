@@ -52,8 +52,8 @@ def read_archive(kind: type[T], path: Path, *, version: str, sha256: str | None 
     content = read_regular(path, most_bytes=LARGEST_FILE)
     if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
         raise InputDataError(
-            f"{path} is not of the run that the result beside it tells of (its SHA-256 is another): run the estimate"
-            " again, or work where its files came from"
+            f"{path} does not belong to the result beside it (its SHA-256 differs): run the estimate again, or use the"
+            " original folder"
         )
     try:
         arrays = _arrays(content)
@@ -119,7 +119,7 @@ def _decode(hint: Any, value: Any, arrays: Mapping[str, NDArray[Any]], finite: b
         array = arrays[value]
         dtype = np.dtype(typing.get_args(arms[1])[0])
         if array.dtype != dtype:
-            raise ValueError(f"an array holds {array.dtype} where {dtype} belongs")
+            raise ValueError(f"an array holds {array.dtype} instead of {dtype}")
         if finite is not None and (np.isinf(array).any() or (finite and np.isnan(array).any())):
             raise ValueError("an array holds numbers that are NaN or infinite")
         array.setflags(write=False)

@@ -118,8 +118,8 @@ class Noise:
     def __post_init__(self) -> None:
         if self.correlation_length_mm is not None and self.surface_sd_mm is None:
             raise ConfigurationError(
-                "[noise] has a correlation_length_mm without a surface_sd_mm, and would not be used: give both, or"
-                " neither, and both are estimated from the residuals"
+                "[noise] has a correlation_length_mm without a surface_sd_mm, so it has no effect: give both, or give"
+                " neither to have both estimated from the residuals"
             )
 
 
@@ -158,13 +158,13 @@ class Estimate:
     def __post_init__(self) -> None:
         if "youngs_modulus" not in self.parameters:
             raise ConfigurationError(
-                f"[estimate] parameters is {shown(list(self.parameters))}; Young's moduli are always sought, Poisson's"
-                ' ratios beside them: ["youngs_modulus"] or ["youngs_modulus", "poisson_ratio"]'
+                f"[estimate] parameters is {shown(list(self.parameters))}; Young's moduli are always estimated and"
+                ' Poisson\'s ratios on demand: ["youngs_modulus"] or ["youngs_modulus", "poisson_ratio"]'
             )
         if self.samples and not SAMPLES[0] <= self.samples <= SAMPLES[1]:
             raise ConfigurationError(
                 f"[estimate] samples is {self.samples}; ask for {SAMPLES[0]} to {SAMPLES[1]} draws in each chain (1000"
-                " are usually enough), or for none with 0"
+                " are usually enough), or 0 for none"
             )
         for starts, bounds, name in (
             (self.start_ratios, self.bounds_ratio, "start_ratios"),
@@ -173,8 +173,8 @@ class Estimate:
             outside = [start for start in starts or () if bounds and not bounds[0] < start < bounds[1]]
             if outside:
                 raise ConfigurationError(
-                    f"[estimate] {name}: {shown(outside)} do not lie between the bounds {list(bounds or ())}; move the"
-                    " start or widen the bounds"
+                    f"[estimate] {name}: {shown(outside)} do not lie between the bounds {list(bounds or ())}; change"
+                    " the start, or widen the bounds"
                 )
 
 
@@ -187,7 +187,7 @@ class Case:
     """
 
     id: str
-    patient: str = field(default="", metadata=rule(test=bool, wanted="a name, or left out, where the case's id is it"))
+    patient: str = field(default="", metadata=rule(test=bool, wanted="a name; without it the case's id is used"))
     stage: int | None = field(default=None, metadata=rule(between=(0, 1000)))
     seed: int = field(default=0, metadata=SEED)
     images: Images | None = None
@@ -222,26 +222,27 @@ class Case:
         refuse_name(self.patient, "the case's patient")
         if sum(part is not None for part in (self.images, self.body, self.phantom)) != 1:
             raise ConfigurationError(
-                f"case '{self.id}' needs either [images] (with before and after) or [phantom], and not both; in place"
-                " of images a [body] with its mesh will do"
+                f"case '{self.id}' needs either [images] (with before and after) or [phantom], but not both; a [body]"
+                " with its mesh may replace the images"
             )
         bare = set(range(1, self.n_states + 1)) - {data.state for data in self.data}
         if self.body is not None and bare:
             of = f" of state {min(bare)}, of {self.n_states}" if self.data else ""
             raise ConfigurationError(
-                f"case '{self.id}' has a [body] and no [[data]]{of}: without images measurements tell how it moved"
+                f"case '{self.id}' has a [body] and no [[data]]{of}: without images, measurements must say how it moved"
             )
         if self.surfaces and self.body is None:
             raise ConfigurationError(
-                f"case '{self.id}' has [[surfaces]] without a [body]; take them out: images have their organs'"
+                f"case '{self.id}' has [[surfaces]] without a [body]; remove them, as images have the surfaces of their"
+                " organs"
             )
         names = [tissue.name for tissue in self.tissues] + [surface.name for surface in self.surfaces]
         if len(set(names)) < len(names):
-            raise ConfigurationError(f"case '{self.id}' gives two tissues or surfaces one name, of {shown(names)}")
+            raise ConfigurationError(f"case '{self.id}' gives two tissues or surfaces the same name: {shown(names)}")
         if self.images is not None and not self.images.after and self.motion is None and not self.loads:
             raise ConfigurationError(
                 "the key 'after' is missing in [images]; name one or more later states of the body (only a simulation"
-                " with [motion] or [[loads]] goes without)"
+                " with [motion] or [[loads]] needs none)"
             )
         if self.pairs and self.images is None:
             raise ConfigurationError(
@@ -249,15 +250,15 @@ class Case:
             )
         if self.phantom is not None and self.loads:
             raise ConfigurationError(
-                f"case '{self.id}' has [[loads]] on a [phantom], whose walls alone move it; take the loads out"
+                f"case '{self.id}' has [[loads]] on a [phantom], which only its walls move; remove the loads"
             )
         stated = [("loads", load.state or 1) for load in self.loads] + [("data", data.state) for data in self.data]
         beyond = [(table, state) for table, state in stated if state > self.n_states]
         if beyond:
             table, state = beyond[0]
             raise ConfigurationError(
-                f"[[{table}]] state = {state}: case '{self.id}' has {self.n_states} later state(s); their numbers begin"
-                " with 1 and follow the order of `after`, those of [[pairs]] last"
+                f"[[{table}]] state = {state}: case '{self.id}' has {self.n_states} later state(s); they are numbered"
+                " from 1 in the order of `after`, and those of [[pairs]] come last"
             )
         self._check_tissues()
         self._check_ratios()
@@ -323,17 +324,17 @@ class Case:
         estimated = any(tissue.role is Role.ESTIMATE for tissue in self.tissues)
         if not estimated and (self.tissues or self.phantom is None):  # a phantom brings its own tissues
             raise ConfigurationError(
-                f"case '{self.id}' has no tissue with role = \"estimate\", so there is nothing to find;"
-                " give that role to the organs whose stiffness you want"
+                f"case '{self.id}' has no tissue with role = \"estimate\", so nothing can be estimated; give that role"
+                " to the organs whose stiffness you want"
             )
         remaining = [tissue.name for tissue in self.tissues if tissue.label == REMAINING]
         if len(remaining) > 1:
             raise ConfigurationError(
-                f"tissues {shown(remaining)} all have label = '{REMAINING}'; only one can be the rest"
+                f"tissues {shown(remaining)} all have label = '{REMAINING}'; only one tissue can be the rest"
             )
         if self.images is not None and self.images.body_from_ct and not remaining:
             raise ConfigurationError(
-                "[images] body_from_ct gives label 0 inside the body to the remaining tissue, and there is none: give"
+                "[images] body_from_ct gives label 0 inside the body to the remaining tissue, but there is none: give"
                 " one tissue label = 'remaining'"
             )
         _check_claims([(t.name, (t.label,) if isinstance(t.label, str) else t.label) for t in self.tissues])
@@ -343,21 +344,22 @@ class Case:
         for tissue in self.tissues:
             if tissue.poisson_ratio_sd is not None and tissue not in sought:
                 raise ConfigurationError(
-                    f"tissue '{tissue.name}' has a poisson_ratio_sd, which would not be used: its Poisson's ratio is"
-                    " not sought. Take it out, or seek those of the `estimate` tissues with [estimate] parameters ="
+                    f"tissue '{tissue.name}' has a poisson_ratio_sd without effect, because its Poisson's ratio is not"
+                    " estimated. Remove it, or estimate those of the `estimate` tissues with [estimate] parameters ="
                     ' ["youngs_modulus", "poisson_ratio"]'
                 )
         low, high = SOUGHT_RATIOS
         for tissue in sought:
             if tissue.poisson_ratio is not None and not low < tissue.poisson_ratio < high:
                 raise ConfigurationError(
-                    f"the Poisson's ratio of '{tissue.name}' is sought between {low} and {high}, and its poisson_ratio"
-                    f" of {tissue.poisson_ratio}, where the search begins, does not lie there: give one that does, or"
-                    ' leave [estimate] parameters at ["youngs_modulus"]'
+                    f"the Poisson's ratio of '{tissue.name}' is estimated between {low} and {high}, but its"
+                    f" poisson_ratio of {tissue.poisson_ratio}, from which the search starts, lies outside: change it,"
+                    ' or leave [estimate] parameters at ["youngs_modulus"]'
                 )
         if self.estimate.seeks_poisson_ratios and self.mechanics.material_law.finite:
             raise ConfigurationError(
-                f"Poisson's ratios are sought under the linear law only, and this case has '{self.mechanics.law}': set"
+                "Poisson's ratios can be estimated under the linear law only, but this case has"
+                f" '{self.mechanics.law}': set"
                 ' [mechanics] law = "linear", or leave [estimate] parameters at ["youngs_modulus"]'
             )
 

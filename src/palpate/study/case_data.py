@@ -21,7 +21,7 @@ KEYS_OF_LOADS = {
     "traction": ("surface", "traction_kpa"),
     "gravity": ("acceleration_m_s2",),
 }
-DIRECTION = rule(between=(-1e3, 1e3), test=any, wanted="the way that the force acts, not (0, 0, 0)")
+DIRECTION = rule(between=(-1e3, 1e3), test=any, wanted="a direction other than (0, 0, 0)")
 COVARIANCE = rule(
     instead_of="sd_mm",
     test=lambda rows: np.allclose(rows, np.transpose(rows)) and np.linalg.eigvalsh(rows)[0] > 0.0,
@@ -59,7 +59,8 @@ class CaseData:
         _check_keys(self, "[[data]]", kind.needs, kind.may_have)
         if self.file is not None and self.sd_mm is None and self.covariance_mm2 is None:
             raise ConfigurationError(
-                f"[[data]] '{self.file.name}' says nothing of its errors: give sd_mm, that of a component in mm"
+                f"[[data]] '{self.file.name}' has no stated error: give sd_mm, the standard deviation of one component"
+                " in mm"
             )
 
     @property

@@ -46,13 +46,13 @@ def read_case(
         reason = getattr(error, "strerror", None) or str(error)
         raise ConfigurationError(f"cannot read the case file {path}: {reason}; check its path") from error
     if len(content) > LARGEST_FILE:
-        raise ConfigurationError(f"{path} is over {LARGEST_FILE} bytes long: this is no case file; give a case.toml")
+        raise ConfigurationError(f"{path} has over {LARGEST_FILE} bytes, so it is not a case file; give a case.toml")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigurationError(
-            f"{path} is not UTF-8 text (byte {error.start}), so it is no case.toml; from images alone an estimate needs"
-            " two or more, the one before and those after"
+            f"{path} is not UTF-8 text (byte {error.start}), so it is not a case.toml; to estimate from images, name at"
+            " least two, before and after"
         ) from error
     table = change(_parse(text, str(path)))
     for override in overrides:
@@ -70,8 +70,7 @@ def read_case(
 def _parse(text: str, where: str) -> dict[str, Any]:
     if max(line.count(".") for line in text.split("\n")) > MOST_DOTS:
         raise ConfigurationError(
-            f"{where} has a line with over {MOST_DOTS} dots, and keys are not read that deep; break a long list into"
-            " several lines"
+            f"{where} has a line with over {MOST_DOTS} dots, too many for a key; break a long list into several lines"
         )
     try:
         return tomllib.loads(text)
@@ -89,7 +88,7 @@ def _parse_override(override: str) -> dict[str, Any]:
     if not equals or not key.strip():
         raise ConfigurationError(f"{shown}: write key.path=value, as in --set mesh.edge_length_mm=3")
     if len(override) > LARGEST_FILE:
-        raise ConfigurationError(f"{shown} is longer than a case file may be")
+        raise ConfigurationError(f"{shown} is longer than a case file may be; shorten it")
     try:
         return _parse(f"{key} = {value}", shown)
     except ConfigurationError as error:

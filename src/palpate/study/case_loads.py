@@ -17,7 +17,7 @@ from palpate.study.case_data import CaseLoad
 
 
 def case_loads(case: Case, space: LagrangeSpace, state: int, *, share: float = 1.0) -> tuple[Load, ...]:
-    """What `case` adds in the later state with a number, from 1, to the loads of the reference, or a `share` of it.
+    """The loads that `case` adds in a later state, numbered from 1, to those of the reference, or a `share` of them.
 
     Those of the reference itself for the number 0.
 
@@ -42,13 +42,13 @@ def loads_on(
         surface = load.surface or ""
         if surface in prescribed:
             raise ConfigurationError(
-                f"[[loads]]: the motion of '{surface}' is prescribed, so a {load.kind} on it does nothing; give it the"
+                f"[[loads]]: the motion of '{surface}' is prescribed, so a {load.kind} on it has no effect; give it the"
                 " role void (a surface of a mesh: the boundary free) if the load is to move it"
             )
         if surface in sliding and load.pressure_kpa is not None:
             raise ConfigurationError(
-                f"[[loads]]: '{surface}' is sliding and does not move along its normal, so a pressure on it does"
-                " nothing; give it the boundary free if the pressure is to move it"
+                f"[[loads]]: '{surface}' is sliding and does not move along its normal, so a pressure on it has no"
+                " effect; give it the boundary free if the pressure is to move it"
             )
         triangles = boundary_named(space.mesh, surface)
         if load.traction_kpa is not None:
@@ -68,9 +68,8 @@ def load_warnings(case: Case) -> tuple[Finding, ...]:
     if case.phantom is not None or not case.mechanics.material_law.finite or case.strained_reference or not heavy:
         return ()
     text = (
-        "gravity acts in a later state, and [[loads]] states none in the reference, which is taken for free of stress:"
-        " where it was seen under its own weight too, moduli at finite strain err by some share of the strain that it"
-        " has there (1 to 4 % of E at 9 %, in a beam); state what acts in `before` with state = 0, and in a later state"
-        " all that acts there, not what is added"
+        "Gravity acts in a later state, but [[loads]] states none in 'before', which is then taken as free of stress;"
+        " moduli at finite strain can be wrong by some per cent. State all loads of 'before' with state = 0, and in"
+        " each later state all loads, not the change."
     )
     return (Finding("weightless-reference", text),)

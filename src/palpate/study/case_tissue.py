@@ -17,7 +17,7 @@ GAUSSIAN, TOTAL_VARIATION = FIELD_PRIORS = ("gaussian", "total-variation")
 TISSUE_ROLES = tuple(str(role) for role in Role if role is not Role.SLIDING)
 KILOPASCALS = (1e-3, 1e9)  # of a modulus: from the softest gels to diamond
 POISSON_RATIO = 0.45
-RATIO_SD, RATIO_SDS = 0.03, (1e-4, 10.0)  # of what is believed of one: soft tissue is usually given 0.40 to 0.49
+RATIO_SD, RATIO_SDS = 0.03, (1e-4, 10.0)  # prior of one: soft tissue usually has 0.40 to 0.49
 POISSON_RATIOS = (-0.99, 0.4999)  # beyond, a solid loses its shape or its volume's give, and equations their digits
 
 
@@ -50,8 +50,8 @@ def is_tissue_name(name: str) -> bool:
 class CaseTissue:
     """A tissue as the case names it: `label` is a tuple of labels, a name of the label table, or "remaining".
 
-    `poisson_ratio` None: 0.45, or what a phantom draws; `poisson_ratio_sd`: standard deviation of what is believed of
-    it where it is sought, None: 0.03. `youngs_modulus_kpa`: a number, or the 95 % range of what is believed of a
+    `poisson_ratio` None: 0.45, or what a phantom draws; `poisson_ratio_sd`: its prior standard deviation
+    where it is estimated, None: 0.03. `youngs_modulus_kpa`: a number, or the 95 % range of what is believed of a
     `known` one. `modulus` "field": it varies in the tissue and is mapped; `field_sd`: prior standard deviation of ln E
     inside, `field_length_mm`: of its kernel; `field_prior`: Gaussian, or by its total variation; `field_modes`: how
     many modes make it at the most.
@@ -64,7 +64,7 @@ class CaseTissue:
         default=None,
         metadata=rule(
             between=POISSON_RATIOS,
-            wanted="an isotropic elastic solid needs -1 < nu < 0.5; soft tissue is usually given 0.40 to 0.49",
+            wanted="an isotropic elastic solid needs -1 < nu < 0.5; soft tissue usually has 0.40 to 0.49",
         ),
     )
     youngs_modulus_kpa: float | tuple[float, float] | None = field(
@@ -83,16 +83,16 @@ class CaseTissue:
         refuse_name(self.name, "the name of a tissue")
         if not is_tissue_name(self.name):
             raise ConfigurationError(
-                f"a tissue cannot be called {shown(self.name)}; choose another name for it: not 'after', no blanks"
-                " around it, and nothing that spreadsheets compute, which begins with =, +, - or @ (also after a ;)"
+                f"a tissue cannot be called {shown(self.name)}; choose a name that is not 'after', has no blanks around"
+                " it, and does not begin with =, +, - or @ (also after a ;), which spreadsheets compute"
             )
         if isinstance(self.label, str):
             refuse_name(self.label, f"the label of tissue '{self.name}'")
         if isinstance(self.youngs_modulus_kpa, tuple):
             if self.role is not Role.KNOWN:
                 raise ConfigurationError(
-                    f"tissue '{self.name}': youngs_modulus_kpa is a range, which is what is believed of a `known`"
-                    f" modulus, but its role is '{self.role}'; give a number, or leave it out"
+                    f"tissue '{self.name}': youngs_modulus_kpa is a range, which only a `known` modulus may have, but"
+                    f" its role is '{self.role}'; give a number, or remove it"
                 )
             if not self.youngs_modulus_kpa[0] < self.youngs_modulus_kpa[1]:
                 raise ConfigurationError(
@@ -101,8 +101,8 @@ class CaseTissue:
                 )
         if self.modulus == "field" and self.role is not Role.ESTIMATE:
             raise ConfigurationError(
-                f"tissue '{self.name}': modulus is \"field\", but its role is '{self.role}'; only a tissue whose"
-                " modulus is estimated can be mapped: give it the role `estimate`, or leave `modulus` out"
+                f"tissue '{self.name}': modulus is \"field\", but its role is '{self.role}'; only an `estimate` tissue"
+                " can be mapped: give it that role, or remove `modulus`"
             )
         self.with_labels(())  # a tissue's constants are checked by the tissue itself
 

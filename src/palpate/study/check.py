@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from palpate.errors import PalpateError, ResourceError
-from palpate.findings import Finding, of_pair, one_a_cause, rank
+from palpate.findings import HELP, Finding, help_on, of_pair, one_a_cause, rank, with_places
 from palpate.images.checks import (
     OBSERVED,
     absent_tissues,
@@ -48,15 +49,26 @@ from palpate.study.refusals import refuse_lost, refuse_unmeshable
 from palpate.study.samples import require_samples
 
 T = TypeVar("T")
+IMAGE = re.compile(r"'(before|after(\[\d+\])?)'")
+NUMBER = re.compile(r"[-+]?\d[\d.,]*")
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Something that an estimate would refuse (`exit_code` > 0) or warn of (0)."""
+    """Something that an estimate would refuse (`exit_code` > 0) or warn of (0).
+
+    place: the image in which a refusal was found ("'after[2]' of pair 2"), if it is about one image.
+    """
 
     code: str
     message: str
     exit_code: int = 0
+    place: str = ""
+
+    @property
+    def cause(self) -> tuple[str, str]:
+        """What refusals with one cause have in common: the code, and the message without images and numbers."""
+        return self.code, NUMBER.sub("", IMAGE.sub("", self.message)) if self.place else self.message
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,10 +82,10 @@ class OrganRow:
 
 @dataclass(frozen=True, slots=True)
 class CheckReport:
-    """All problems of a case, its organs and what its estimate would cost (None when that cannot be told).
+    """All problems of a case, its organs and the expected cost of its estimate (None when that is unknown).
 
-    alignments: how each later image lay, by its name; none where nothing was aligned; measured: what was read of each
-    file of [[data]], by its name; predicted: the intervals that may be expected, where they were asked for.
+    alignments: how each later image lay, by its name; none where nothing was aligned; measured: in words what was read
+    from each file of [[data]], by its name; predicted: the expected intervals, where they were asked for.
     """
 
     id: str
@@ -108,6 +120,7 @@ class CheckReport:
                     "message": problem.message,
                     "exit_code": problem.exit_code,
                 }
+                | ({} if problem.exit_code else {"help": help_on(problem.code)})
                 for problem in self.problems
             ],
             "alignment": [found.row(name) for name, found in self.alignments],
@@ -136,7 +149,8 @@ class CheckReport:
     def text(self) -> str:
         """The same for people, worst first."""
         lines = [f"refused ({p.exit_code}): {p.message}" for p in self.problems if p.exit_code]
-        lines += [f"warning ({p.code}): {p.message}" for p in self.problems if not p.exit_code]
+        warned = [f"warning ({p.code}): {p.message}" for p in self.problems if not p.exit_code]
+        lines += [*warned, f"each code is explained on {HELP}"] if warned else []
         if not lines:
             lines = ["no problem was found"]
         for row in self.organs:
@@ -155,7 +169,7 @@ class CheckReport:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """A case as far as it was found good: its report, and what was made on the way.
+    """The report of a case, and what was made for it.
 
     states: its pairs of images that can be read, aligned; bodies: their meshes, none where something was refused.
     """
@@ -173,14 +187,15 @@ class _Problems:
         self.found: list[Problem] = []
         self._findings: list[Finding] = []
 
-    def attempt(self, make: Callable[[], T]) -> T | None:
-        """What `make` returns; None, and a problem, when it is refused."""
+    def attempt(self, make: Callable[[], T], *, place: str = "") -> T | None:
+        """What `make` returns; None, and a problem at that place, when it is refused."""
         try:
             return make()
         except PalpateError as error:
-            self.add(Problem(type(error).__name__, str(error), error.exit_code))
+            self.add(Problem(type(error).__name__, str(error), error.exit_code, place))
         except MemoryError:
-            self.add(Problem("ResourceError", "memory is short for these images; crop them", ResourceError.exit_code))
+            text = "these images need more memory than is free; crop them to the organs"
+            self.add(Problem("ResourceError", text, ResourceError.exit_code))
         return None
 
     @property
@@ -189,19 +204,28 @@ class _Problems:
         return any(problem.exit_code for problem in self.found)
 
     def add(self, problem: Problem) -> None:
-        """Keep a problem once."""
-        if problem not in self.found:
-            self.found.append(problem)
+        """Keep a problem once; a refusal that was found before its image was looked at gets its place."""
+        for number, known in enumerate(self.found):
+            if known in (problem, replace(problem, place="")):
+                self.found[number] = problem
+                return
+        self.found.append(problem)
 
     def warn(self, findings: Sequence[Finding], pair: int = 1) -> None:
         """Keep findings on the images of a pair."""
         self._findings += of_pair(findings, pair)
 
     def all(self) -> tuple[Problem, ...]:
-        """Everything that was kept, one a cause: refusals as they were found, then warnings, worst first."""
+        """All problems, once for each cause: refusals as they were found, then warnings, most harmful first."""
         warned = [p for p in self.found if not p.exit_code]
         warned += [Problem(each.code, each.message) for each in one_a_cause(self._findings)]
-        refused = [p for p in self.found if p.exit_code]
+        causes: dict[tuple[str, str], list[Problem]] = {}
+        for refusal in (p for p in self.found if p.exit_code):
+            causes.setdefault(refusal.cause, []).append(refusal)
+        refused = [
+            replace(first, message=with_places(first.message, [*dict.fromkeys(other.place for other in others)]))
+            for first, *others in causes.values()
+        ]
         return (*refused, *sorted(warned, key=lambda problem: rank(problem.code)))
 
 
@@ -215,8 +239,8 @@ def checked_case(
 ) -> Checked:
     """All problems of a case, or of a case file (with overrides as in `read_case`), its organs and its expected cost.
 
-    It does what an estimate does up to where solving begins, and refuses with the same sentence; where an estimate ends
-    it goes on, to find the other problems. Without `meshed` it ends before the mesh. Raises nothing for a bad case.
+    It does what an estimate does before it solves, and refuses with the same sentence. Where an estimate would stop it
+    continues, to find the other problems. Without `meshed` it stops before the mesh. It raises nothing for a bad case.
     """
     problems = _Problems()
     if isinstance(source, Case):
@@ -253,7 +277,7 @@ def checked_case(
 
 
 def _remarks(problems: _Problems, case: Case, pairs: Sequence[ImagedStates]) -> None:
-    """What an estimate would warn of, what organs do to each other, and grey images that its report cannot show."""
+    """Keep the warnings of an estimate, the findings on contacts, and grey images that the report cannot show."""
     for number, pair in enumerate(pairs, start=1):
         problems.warn(pair.findings, number)
         if pair.mesh is None:
@@ -262,15 +286,16 @@ def _remarks(problems: _Problems, case: Case, pairs: Sequence[ImagedStates]) -> 
         try:
             read_intensities(grey)
         except PalpateError as error:
-            problems.add(Problem("report", f"the report will show labels in place of the grey image: {error}"))
+            text = f"The report will show labels instead of the grey image, which cannot be read. {error}"
+            problems.add(Problem("report", text))
 
 
 def _cost(
     problems: _Problems, pairs: Sequence[ImagedStates], case: Case, progress: Progress, *, meshed: bool
 ) -> tuple[ExpectedCost, tuple[Body, ...]]:
-    """What an estimate would cost on its very meshes, and these; on meshes of a guessed size where one is refused.
+    """The expected cost on the meshes of the estimate, and the meshes; on guessed sizes where one is refused.
 
-    All is made of which an estimate begins to solve; `meshed`: else nothing is.
+    meshed: whether the meshes are made.
     """
     first = pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(pairs), mesh=first.mesh)
@@ -354,11 +379,12 @@ def _checked_pair(
     problems.attempt(partial(refuse_unmeshable, before, "before"))
     for name, image in zip(later_names(len(after)), after, strict=True):
         problems.warn(check_segmentation(image, name), number)
-        problems.attempt(partial(refuse_unmeshable, image, name))
+        place = f"'{name}'" + (f" of pair {number}" if number > 1 else "")
+        problems.attempt(partial(refuse_unmeshable, image, name), place=place)
         if in_place:
-            problems.attempt(partial(refuse_lost, before, image, name))
+            problems.attempt(partial(refuse_lost, before, image, name), place=place)
         if any(tissue.role in OBSERVED for tissue in before.tissues):
-            findings = problems.attempt(partial(check_pair, before, image, name=name))
+            findings = problems.attempt(partial(check_pair, before, image, name=name), place=place)
             problems.warn(findings or (), number)
     problems.warn(every_finding(before, after, loaded=bool(case.loads)), number)
     return replace(states, before=before, after=after)
@@ -371,20 +397,21 @@ def _without(image: Segmentation, absent: Collection[int]) -> Segmentation:
 
 
 def memory_problems(cost: ExpectedCost) -> list[Problem]:
-    """A problem when this machine's memory may not do, refused where it will not; else when too little is free now."""
+    """A problem where this machine has too little memory (refused), may have too little, or has too little free now."""
     has, free = machine_memory_gb(), free_memory_gb()
     lack = lack_of_memory(cost)
     if lack:
         return [Problem("memory", f"{lack}; {LESS_MEMORY}", ResourceError.exit_code)]
     if has is not None and cost.memory_gb > has / MEMORY_FACTOR:
         text = (
-            f"about {cost.memory_gb:.1f} GB of memory will be needed and this machine has {has:.1f} GB; {LESS_MEMORY}"
+            f"The estimate needs about {cost.memory_gb:.1f} GB of memory, and this machine has {has:.1f} GB. If memory"
+            f" runs out, {LESS_MEMORY}."
         )
         return [Problem("memory", text)]
     if free is not None and cost.memory_gb > free / MEMORY_FACTOR:
         text = (
-            f"about {cost.memory_gb:.1f} GB of memory will be needed and at the moment {free:.1f} GB are free: end"
-            " other programs, or wait for them"
+            f"The estimate needs about {cost.memory_gb:.1f} GB of memory, and {free:.1f} GB are free at the moment. End"
+            " other programs, or wait for them."
         )
         return [Problem("memory-now", text)]
     return []

@@ -1,4 +1,4 @@
-"""What organs do to each other in the images: how much of a surface they share, and how far it moves."""
+"""Findings on organs beside each other in the images: how much surface they share, and how far it moves."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.findings import Finding
+from palpate.findings import Finding, listing
 from palpate.images.checks import STILL_VOXELS, later_names, wall_motion
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
@@ -18,10 +18,10 @@ LITTLE_OBSERVED = 0.5
 
 
 def contact_findings(segmentation: Segmentation) -> tuple[Finding, ...]:
-    """A finding for each `estimate` tissue that touches a driver, a bone or the image's border with much of it.
+    """A finding for each `estimate` tissue of which much touches a driver, a bone or the image's border.
 
-    Such faces are prescribed or cut and are left out of the observation, as `observed_surface` does on the mesh, which
-    refuses what leaves less than a tenth.
+    Such faces are prescribed or cut, and are left out of the observation, as `observed_surface` does on the mesh. It
+    refuses a tissue of whose surface less than a tenth is left.
     """
     faces = _shared_faces(segmentation)
     tissues = segmentation.tissues
@@ -30,25 +30,28 @@ def contact_findings(segmentation: Segmentation) -> tuple[Finding, ...]:
         total = float(faces[i].sum() - faces[i, i])
         if tissue.role is not Role.ESTIMATE or not total:
             continue
-        held = {tissues[j].name: faces[i, j] / total for j in range(len(tissues)) if tissues[j].role in PRESCRIBED}
+        held = {
+            f"'{tissues[j].name}'": faces[i, j] / total for j in range(len(tissues)) if tissues[j].role in PRESCRIBED
+        }
         held["the image's border"] = faces[i, -1] / total
         shares = {name: share for name, share in held.items() if share >= 0.01}
         left = 1.0 - sum(held.values())
         if not shares or left > 1.0 - LITTLE_OBSERVED / 5.0:
             continue
-        words = ", ".join(f"{name} ({share:.0%})" for name, share in shares.items())
-        text = (
-            f"'{tissue.name}' touches {words}; those faces say nothing about its stiffness, and {left:.0%} of its"
-            " surface is left to observe"
+        words = [f"{name} ({share:.0%})" for name, share in shares.items()]
+        rest = (
+            f"; those faces say nothing about its stiffness, so {left:.0%} of its surface is observed. Nothing needs to"
+            " be done: the interval allows for it."
         )
-        findings.append(Finding("touching", text, tissue.name))
+        text = listing(f"'{tissue.name}' touches ", words, rest)
+        findings.append(Finding("touching", text, tissue.name, "in 'before'"))
     return tuple(findings)
 
 
 def motion_findings(
     before: Segmentation, after: Segmentation, name: str, *, loaded: bool = False
 ) -> tuple[Finding, ...]:
-    """A finding for the image called `name` when no driver's or bone's surface in it moves by more than the noise.
+    """A finding for the image called `name` when no driver's or bone's surface moves in it by more than the noise.
 
     `loaded`: known loads act, which move the organs themselves, so theirs count, too.
     """
@@ -58,12 +61,12 @@ def motion_findings(
     motions = {before.tissues[i].name: wall_motion(before, after, i) for i in movers}
     if not motions or max(motions.values()) > STILL_VOXELS * voxel:
         return ()
-    words = ", ".join(f"{tissue} {motion:.2g} mm" for tissue, motion in motions.items())
-    text = (
-        f"hardly anything moves from 'before' to '{name}' (mean motion of the walls: {words}; voxels of {voxel:.2g}"
-        " mm): the motion is not above the noise of the voxels, and intervals will be wide; use a pair with more"
-        f" {'load' if loaded else 'filling'}"
+    words = [f"'{tissue}' {motion:.2g} mm" for tissue, motion in motions.items()]
+    rest = (
+        f". That is no more than voxels of {voxel:.2g} mm can show, so intervals will be wide: use a pair with a larger"
+        f" {'load' if loaded else 'motion'}."
     )
+    text = listing(f"Almost nothing moves from 'before' to '{name}'; mean motion of the surfaces: ", words, rest)
     return (Finding("motion-below-noise", text, place=f"to '{name}'"),)
 
 
@@ -74,10 +77,11 @@ def sides_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]
     wrong = [left for left, right in twins if right in middles and middles[left] > middles[right]]
     if not wrong:
         return ()
-    text = (
-        f"in '{name}', {', '.join(repr(left) for left in wrong)} lies to the right of its namesake: left and right are"
-        " exchanged in the names or in the header; stiffness does not mind, but check the image's orientation"
+    rest = (
+        " lies to the right of its namesake, so left and right are exchanged in the names or the header. The moduli are"
+        " not affected, but check the image's orientation."
     )
+    text = listing(f"In '{name}' ", [f"'{left}'" for left in wrong], rest)
     return (Finding("sides-exchanged", text, place=f"in '{name}'"),)
 
 
@@ -90,8 +94,8 @@ def front_findings(segmentation: Segmentation, name: str) -> tuple[Finding, ...]
     if not wrong:
         return ()
     text = (
-        f"in '{name}', '{wrong[0][0]}' lies in front of '{wrong[0][1]}': the file is mirrored front to back, or its"
-        " header is wrong; stiffness does not mind where all images are so, but check the images' orientation"
+        f"In '{name}' '{wrong[0][0]}' lies in front of '{wrong[0][1]}', so the file is mirrored front to back or its"
+        " header is wrong. The moduli are not affected if all images are alike, but check their orientation."
     )
     return (Finding("front-exchanged", text, place=f"in '{name}'"),)
 

@@ -1,4 +1,4 @@
-"""What an estimate found of all that a model leaves out: the frame's motion, how surfaces are drawn, the material."""
+"""What the estimate found of effects beside the moduli: motion of the frame, offset surfaces, inhomogeneity."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class FrameFound:
 
 @dataclass(frozen=True, slots=True)
 class OffsetFound:
-    """By how much further out (mm) a tissue's surface is drawn in a later image, with a 95 % interval."""
+    """How much further out (mm) a tissue's surface is drawn in a later image, with a 95 % interval."""
 
     tissue: str
     state: int
@@ -43,7 +43,7 @@ class OffsetFound:
 
     @property
     def told(self) -> bool:
-        """Whether it is so much larger than its own uncertainty that it is worth a sentence."""
+        """Whether it is so much larger than its own uncertainty that it is a warning."""
         sd = (self.interval95[1] - self.interval95[0]) / (2.0 * NORMAL_95)
         return abs(self.mm) > max(TOLD * sd, LEAST_TOLD_MM)
 
@@ -59,7 +59,7 @@ class HeterogeneityFound:
 
 @dataclass(frozen=True, slots=True)
 class LayerFound:
-    """How stiff a layer round an organ is, over the tissue that it is of, with a 95 % interval."""
+    """Ratio of the stiffness of a layer around an organ to that of the tissue it belongs to, with a 95 % interval."""
 
     tissue: str
     ratio: float
@@ -113,7 +113,7 @@ class FittedMaterial:
 
 
 def fitted_materials(inversion: Inversion) -> tuple[FittedMaterial, ...]:
-    """The material of the best minimum, one a later state."""
+    """The material of the best minimum, one for each later state."""
     parameters, found = inversion.objective.parameters, list[FittedMaterial]()
     unknowns = inversion.minimum.unknowns
     coefficients, blocks = parameters.coefficients(unknowns), enumerate(parameters.blocks)
@@ -172,27 +172,26 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
 
 
 def discrepancy_findings(found: FoundDiscrepancy) -> tuple[Finding, ...]:
-    """A sentence for each surface that is drawn otherwise in a later image, and for each layer round an organ."""
+    """A finding for each surface that is drawn differently in a later image, and for each layer around an organ."""
     findings = []
     names = later_names(1 + max((offset.state for offset in found.offsets), default=0))
     for offset in found.offsets:
         if offset.told:
-            how = "larger" if offset.mm > 0.0 else "thinner or smaller"
-            place = f"in '{names[offset.state]}'"
+            image = f"in '{names[offset.state]}'"
             text = (
-                f"'{offset.tissue}' is drawn {abs(offset.mm):.2g} mm {how} on every side {place} than its motion"
-                f" explains ({offset.interval95[0]:.2g} to {offset.interval95[1]:.2g} mm): the outer wall in one image"
-                " and the lumen in the other, or another reader? The estimate has taken it out; draw both alike to be"
-                " sure"
+                f"The surface of '{offset.tissue}' {image} lies {abs(offset.mm):.2g} mm further"
+                f" {'out' if offset.mm > 0.0 else 'in'} than its motion explains (95 % interval:"
+                f" {offset.interval95[0]:.2g} to {offset.interval95[1]:.2g} mm). The estimate allows for it; to be"
+                " sure, draw it in the same way in both images."
             )
-            findings.append(Finding("drawn-otherwise", text, place=place))
+            findings.append(Finding("drawn-otherwise", text, offset.tissue, f"{image} ({offset.mm:+.2g} mm)"))
     for layer in found.layers:
         if layer.told:
             low, high = layer.interval95
             text = (
-                f"round '{layer.tissue}' lies a layer that is {layer.ratio:.2g} times as stiff as the tissue that it is"
-                f" of ({low:.2g} to {high:.2g}): a film of fat, a capsule, or a plane on which it slides? The estimate"
-                " has it, for the images are more likely so; a modulus of another study without it is another quantity"
+                f"The data fit better with a layer around '{layer.tissue}' that is {layer.ratio:.2g} times as stiff as"
+                f" the tissue it belongs to ({low:.2g} to {high:.2g}), such as fat, a capsule or a sliding plane. The"
+                " estimate includes it: do not compare the modulus with one from a model without it."
             )
             findings.append(Finding("layer", text))
     return tuple(findings)

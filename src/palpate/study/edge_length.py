@@ -56,7 +56,7 @@ def edge_length_of(case: Case, before: Segmentation, after: Sequence[Segmentatio
     surface = float(np.hypot(voxel * SURFACE_MM, case.noise.surface_sd_mm or 0.0))
     order = 1.0 if choose_element(case.mechanics.element).space == "P2" else LINEAR
     factor = order * float(np.clip(np.sqrt(surface / SURFACE_MM), *FACTORS))
-    longest = (order * LONGEST_MM, "the longest that shows the surface of an organ")
+    longest = (order * LONGEST_MM, "the longest that still resolves an organ's surface")
     of_organs = dict[str, tuple[float, str]]()
     for i, tissue in enumerate(before.tissues):
         if tissue.role in ACROSS_BALL and (mask := before.mask(i)).any():
@@ -75,7 +75,7 @@ def edge_length_of(case: Case, before: Segmentation, after: Sequence[Segmentatio
     mm, reason = min([longest, *of_organs.values()])
     least = max(LEAST_MM, LEAST_VOXELS * voxel)
     if mm < least:
-        reason = f"the shortest that is chosen, for {reason} would be {mm:.1f} mm"
+        reason = f"the shortest that is chosen automatically; {reason} would be {mm:.1f} mm"
         mm = STEP_MM * float(np.ceil(least / STEP_MM - 1e-9))
     own = {name: h for name, (h, _) in of_organs.items()}
     own = own if max(own.values(), default=0.0) >= UNLIKE * mm else {}

@@ -1,4 +1,4 @@
-"""What an estimate finds out about itself: ratios only, what is not settled, several minima, folds."""
+"""Warnings that come from the estimate itself: ratios only, not converged, several minima, folded elements."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.findings import Finding
+from palpate.findings import Finding, listing
 from palpate.images.checks import later_names
 from palpate.inversion import Inversion, Outcome
 from palpate.mechanics.element import deformation_determinants
@@ -23,32 +23,35 @@ NOISIER, LEAST_IMAGES = 1.6, 3  # times the usual noise of so many later images:
 
 
 def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) -> tuple[Finding, ...]:
-    """What the search itself tells of its result; covariance (n, n) of the parameters."""
+    """Findings on the search and its result; covariance (n, n) of the parameters."""
     mapping = inversion.objective.parameters
     findings = []
     if not mapping.absolute:
         findings.append(
             Finding(
                 "ratio-only",
-                f"no tissue's modulus is known, so only ratios to '{mapping.relative_to}' are determined; give one"
-                " tissue role `known` with its youngs_modulus_kpa to get kPa",
+                f"No modulus and no load is known, so only ratios to '{mapping.relative_to}' are determined. To get"
+                " kPa, give one tissue the role known with its youngs_modulus_kpa, or state a load.",
             )
         )
     if inversion.convergence.unmet:
         findings.append(
             Finding(
                 "unsettled",
-                f"the iteration ended with what it asks for not met: {'; '.join(inversion.convergence.unmet)};"
-                " the model may not fit the images (edge length, driver modes, law), or [noise] should be given",
+                listing(
+                    "The search ended before it converged: ",
+                    inversion.convergence.unmet,
+                    ". The model may not fit the data: try a smaller mesh.edge_length_mm, another law, or [noise].",
+                ),
             )
         )
     if inversion.unsettled:
         findings.append(
             Finding(
                 "unsettled",
-                f"with the stiffness of layers round organs free the estimate did not end ({inversion.unsettled}), so"
-                " that intervals may not hold what a soft or stiff layer would do; another [mesh] edge_length_mm may"
-                " help, or [discrepancy] layer_sd = 0 where there is none",
+                "The search with soft or stiff layers around organs did not converge (log.txt says why), so intervals"
+                " may miss the effect of such a layer. Try another mesh.edge_length_mm, or set discrepancy.layer_sd = 0"
+                " if there is none.",
             )
         )
     lost = [c for c in inversion.candidates if c.minimum.outcome is Outcome.NO_EQUILIBRIUM]
@@ -57,57 +60,65 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
             Finding(
                 "no-equilibrium",
                 f"{len(lost)} of {len(inversion.candidates)} minima of the linear law have no equilibrium under the"
-                " case's law and are not compared with the others; other [estimate] start_ratios show"
-                " whether they are minima at all",
+                " case's law, so they were not compared with the others. Try other estimate.start_ratios to see whether"
+                " they are minima at all.",
             )
         )
     left = sum(c.minimum.outcome is Outcome.NOT_FOLLOWED for c in inversion.candidates)
-    unknown = f", but for {left} that could not be followed under the law (log.txt says why)" if left else ""
+    unknown = f", except {left} that could not be followed (log.txt says why)" if left else ""
     if len(inversion.candidates) - len(lost) > 1:
         findings.append(
             Finding(
                 "several-minima",
-                "the starts ended in different minima; the best fit under one noise model is reported, and the"
-                f" intervals reach over all that fit nearly as well{unknown}",
+                "The starts of the search ended in different minima; the best fit is reported, and its intervals cover"
+                f" all that fit nearly as well{unknown}. Look at starts in result.json; use a pair with a larger"
+                " motion.",
             )
         )
     sd = np.sqrt(np.diag(covariance))
     pairs = np.argwhere(np.tril(np.abs(covariance) > STRONG_CORRELATION * np.outer(sd, sd), -1)).tolist()
     if pairs:
         alike = [f"'{mapping.names[j]}' and '{mapping.names[i]}'" for i, j in pairs]
-        what = "the moduli of" if np.max(pairs) < len(mapping.tissues) else "the parameters of"
-        text = f"{what} {', of '.join(alike)} cannot be told apart by these images"
-        findings.append(Finding("correlated", f"{text}; add some that move them otherwise"))
+        what = "moduli" if np.max(pairs) < len(mapping.tissues) else "parameters"
+        rest = ". Add images in which they move differently, or join them."
+        text = listing(f"These data cannot separate the {what} of ", alike, rest)
+        findings.append(Finding("correlated", text))
     return tuple(findings)
 
 
-def pair_findings(pairs: ImagePairs | None) -> tuple[Finding, ...]:
-    """What is told of later images: which the others contradict, which fit worse, whether the rest differ by more."""
+def pair_findings(pairs: ImagePairs | None, names: Sequence[str] = ()) -> tuple[Finding, ...]:
+    """Findings on several later images: outliers, images that fit worse, and differences beyond their noise."""
     if pairs is None:
         return ()
     findings, several = list[Finding](), len(pairs.alone) >= LEAST_IMAGES
-    for name, pair in zip(later_names(len(pairs.alone)), pairs.alone, strict=True):
+    for name, pair in zip(names or later_names(len(pairs.alone)), pairs.alone, strict=True):
         for kind, noise in pair.noise_mm.items() if several else ():
             usual = float(np.median([other.noise_mm[kind] for other in pairs.alone if other is not pair]))
             if noise > NOISIER * usual:
-                text = f"'{name}' fits worse than the other later images: noise of {noise:.2g} mm beside {usual:.2g} mm"
-                advice = f"{text}, so that it counts for less. Look at its labels; it may be left out"
-                findings.append(Finding("pair-noise", advice, place=f"in '{name}'"))
+                text = (
+                    f"'{name}' fits worse than the other later images, with noise of {noise:.2g} mm instead of"
+                    f" {usual:.2g} mm, so it has less weight. Check its labels, or leave it out."
+                )
+                findings.append(Finding("pair-noise", text, kind, f"'{name}' ({noise:.2g} mm)"))
         if pair.outlier:
-            moved = ", ".join(f"{tissue} by {by:+.1f}" for tissue, by in pair.influence.items())
-            mean = ", ".join(f"{tissue} {value:.3g}" for tissue, value in pairs.mean.items())
-            text = f"'{name}' contradicts the other later images: it moves the mean of {moved} standard deviations;"
-            advice = f"{text} without it the mean is {mean}. Look at its labels, or leave it out"
-            findings.append(Finding("pair-outlier", advice, place=f"in '{name}'"))
+            moved = [
+                f"'{tissue}' by {by:+.1f} standard deviations ({pairs.mean[tissue]:.3g} without it)"
+                for tissue, by in pair.influence.items()
+            ]
+            lead = f"'{name}' contradicts the other later images, and changes the mean modulus of "
+            text = listing(lead, moved, ". Check its labels, or leave it out.")
+            findings.append(Finding("pair-outlier", text, place=f"'{name}'"))
     if pairs.heterogeneity_p < HETEROGENEOUS:
-        text = f"the later images differ by more than their noise (p = {pairs.heterogeneity_p:.1g})"
-        advice = f"{text}: read the mean over them, `image_pairs` in result.json, whose interval holds the differences"
-        findings.append(Finding("heterogeneous", advice))
+        text = (
+            f"The later images differ by more than their noise (p = {pairs.heterogeneity_p:.1g}), which the joint"
+            " interval does not cover. Use the mean in image_pairs of result.json, whose interval does."
+        )
+        findings.append(Finding("heterogeneous", text))
     return tuple(findings)
 
 
 def data_findings(inversion: Inversion) -> tuple[Finding, ...]:
-    """A finding for each reading of an instrument whose sign no modulus gives."""
+    """A finding for each measured force of a sign that no modulus explains."""
     findings, mapping, unknowns = [], inversion.objective.parameters, inversion.minimum.unknowns
     for line in inversion.minimum.evaluation.linearisations:
         seen = line.observation
@@ -117,18 +128,18 @@ def data_findings(inversion: Inversion) -> tuple[Finding, ...]:
             alone = seen.measured + float(line.residuals.values[0]) - offset
             if alone * seen.measured < 0.0:
                 text = (
-                    f"the {seen.name} was measured as {seen.measured:.3g} {seen.unit}, and the motion needs one of the"
-                    f" other sign ({alone:.2g} {seen.unit} at these moduli), so that no modulus explains it: turn its"
-                    " direction round. It is positive where it pulls the surface along its direction"
+                    f"The {seen.name} was measured as {seen.measured:.3g} {seen.unit}, but the motion needs the"
+                    f" opposite sign ({alone:.2g} {seen.unit}), so no modulus explains it. Reverse its direction: a"
+                    " force is positive where it pulls the surface along its direction."
                 )
                 findings.append(Finding("force-reversed", text, seen.name, place=f"in state {line.state + 1}"))
     return tuple(findings)
 
 
-def fold_findings(states: Sequence[FittedState]) -> tuple[Finding, ...]:
-    """A finding for each later image in which the fitted model turns elements inside out."""
+def fold_findings(states: Sequence[FittedState], names: Sequence[str]) -> tuple[Finding, ...]:
+    """A finding for each later image in which the fitted motion turns elements inside out."""
     findings = []
-    for name, state in zip(later_names(len(states)), states, strict=True):
+    for name, state in zip(names, states, strict=True):
         space = state.space
         smallest = deformation_determinants(space, state.displacement).min(axis=1)
         folded = int(np.count_nonzero(smallest <= 0.0))
@@ -137,9 +148,9 @@ def fold_findings(states: Sequence[FittedState]) -> tuple[Finding, ...]:
             findings.append(
                 Finding(
                     "fold-over",
-                    f"'{name}': {folded} of {len(smallest)} elements are turned inside out, the worst near"
-                    f" {np.round(worst).astype(int).tolist()} mm (RAS): the motion is too large there for the law or"
-                    " the mesh. Look at the labels there, or set a smaller [mesh] edge_length_mm",
+                    f"The motion to '{name}' turns {folded} of {len(smallest)} elements inside out, the worst near"
+                    f" {np.round(worst).astype(int).tolist()} mm (RAS). Check the data there, try a smaller"
+                    " mesh.edge_length_mm or a law at finite strain.",
                     place=f"in '{name}' ({folded})",
                 )
             )

@@ -53,7 +53,7 @@ class Start:
 class ModulusEstimate:
     """Young's modulus of one tissue, in `unit` (kPa, or a ratio to `relative_to`), with its 95 % interval.
 
-    interval95: what is believed with all discrepancies of the model unknown, layers too, by which the verdict is told;
+    interval95: with all discrepancies of the model as unknowns, layers too; the verdict follows from it;
     interval95_given_model: what would be left if the model held. None: no interval is stated, as of every modulus that
     is not identified; `value` is None in ratio mode and when nothing converged. variance_shares: of each cause in the
     variance of ln E; profile: values (kPa, or ratios) with their signed root deviances.
@@ -124,7 +124,7 @@ class Estimation:
     known where single moduli are not; regions: joint ones of two moduli; forces, points: measured and fitted;
     image_pairs: what each of several later images says alone; samples: of the moduli's posterior,
     where the case asks for them and the estimate converged; variations: what would change the answer; maps: of tissues
-    whose modulus is a field; materials: of the elements, one a later state.
+    whose modulus is a field; materials: of the elements, one for each later state.
     """
 
     status: str

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.images.checks import later_names
 from palpate.inversion import (
     Inversion,
     InversionSettings,
@@ -92,10 +93,13 @@ def conclude(
     if minimum.converged:  # of each kind of data in what is known of a tissue's modulus
         of_tissues = information_shares(minimum.evaluation, objective.n_parameters)
         shares = dict(zip(objective.parameters.tissues, of_tissues, strict=False))
+    names = later_names(len(observed.images))
+    if all(image is None for image in observed.images):  # the body is given as a mesh
+        names = [f"state {number}" for number in range(1, len(observed.images) + 1)]
     findings = (
         *inversion_findings(inversion, covariance.total),
-        *pair_findings(pairs),
-        *fold_findings(observed.states),
+        *pair_findings(pairs, names),
+        *fold_findings(observed.states, names),
         *data_findings(inversion),
         *(misfit.finding for misfit in misfits),
         *sample_findings(drawn),
@@ -139,7 +143,7 @@ def _reason(inversion: Inversion) -> str:
     minima = f"{distinct} distinct {'minimum' if distinct == 1 else 'minima'}"
     starts = f"{inversion.minimum.outcome.value}; {len(ended)} of {len(inversion.starts)} starts"
     if not inversion.minimum.converged:
-        return f"{starts} led to {minima} of the model that they share, from where the estimate went on and did not end"
+        return f"{starts} led to {minima} of the starting model, but the estimate from there did not converge"
     outcomes = [candidate.minimum.outcome for candidate in inversion.candidates]
     lost, left = outcomes.count(Outcome.NO_EQUILIBRIUM), outcomes.count(Outcome.NOT_FOLLOWED)
     return (

@@ -1,4 +1,4 @@
-"""The images of a case brought to the first of them: how each lay, what is said of it, what is refused."""
+"""The images of a case aligned to the first of them: how each lay, its warnings, and what is refused."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from palpate.errors import InputDataError
-from palpate.findings import Finding
+from palpate.findings import Finding, listing, some
 from palpate.images.alignment import Alignment, Motion, align, moved
 from palpate.images.checks import check_headers, check_images, later_names, refuse_absent, refuse_unit
 from palpate.images.registration import ON, Registration, registration
@@ -129,7 +129,7 @@ def brought(
 
 
 def _frame_findings(before: Segmentation, found: Registration, name: str, *, aligned: bool = True) -> list[Finding]:
-    """What is said of a motion of the whole that is larger than a third of what the organs do against each other."""
+    """A finding on a motion of the whole body of more than a third of the motion of the organs against each other."""
     own = found.own_motion_mm(before.tissues)
     moved_mm = float(np.hypot(found.distance_mm, LEVER_MM * np.deg2rad(found.rotation_deg)))
     if moved_mm <= SMALL_FRAME_MOTION * own or moved_mm < SEEN_MM:
@@ -138,45 +138,43 @@ def _frame_findings(before: Segmentation, found: Registration, name: str, *, ali
     place = f"in '{name}' ({size})"
     if aligned:
         text = (
-            f"'{name}' lay {size} elsewhere, measured on {ON[found.by]}, where organs and drivers move by {own:.2g} mm"
-            " against each other: it was brought back before anything was compared; look at the alignment in the report"
+            f"The body in '{name}' lay {size} from 'before', measured on {ON[found.by]}, and was moved back; its parts"
+            f" move by {own:.2g} mm against each other. Check the alignment in the report."
         )
         return [Finding("frame-aligned", text, place=place)]
     text = (
-        f"all surfaces together say that '{name}' lies {size} elsewhere, where organs and drivers move by {own:.2g} mm"
-        " against each other, and nothing was done about it, for the case states that the images lie on each other: an"
-        " offset in a header (half a voxel, say), or a patient who lay otherwise, will pass for motion of the organs."
-        ' Look at the headers, or set images.align = "surfaces"'
+        f"The body in '{name}' lies {size} from 'before' and was not moved back, so that this offset counts as"
+        f" deformation; its parts move by {own:.2g} mm against each other. Check the headers, or set"
+        ' images.align = "surfaces".'
     )
     return [Finding("frame-moves", text, place=place)]
 
 
 def alignment_findings(alignment: Alignment, name: str) -> list[Finding]:
-    """What the motion of the bones to the image called `name` rests on, all bones in one finding a cause."""
+    """Findings on the motion of the bones to the image called `name`: one for each cause, with all its bones."""
     findings = []
     unseen = [bone for bone, fit in alignment.tissues.items() if fit.n_points == 0]
     if unseen:
-        text = (
-            f"too little of the surface of {_quoted(unseen)} is seen in '{name}' for a motion of its own, so that it"
-            " moves with the other rigid tissues; a larger field of view shows more"
-        )
-        findings.append(Finding("rigid-unseen", text, place=f"in '{name}' ({_quoted(unseen)})"))
+        rest = " for a motion of its own, so it moves with the other rigid tissues. Use a larger field of view, if any."
+        text = listing(f"'{name}' shows too little of the surface of ", _quoted(unseen), rest)
+        findings.append(Finding("rigid-unseen", text, place=f"in '{name}' ({some(_quoted(unseen), most=2)})"))
     if alignment.loose:
-        off = ", ".join(f"'{bone}' {distance:.1f} mm" for bone, distance in alignment.loose.items())
-        text = (
-            f"pieces of a rigid tissue lie off the motion of the whole, which moves as one body, in '{name}': {off};"
-            " give each bone a tissue of its own"
-        )
-        findings.append(Finding("several-bodies", text, place=f"in '{name}' ({off})"))
+        off = [f"'{bone}' {distance:.1f} mm" for bone, distance in alignment.loose.items()]
+        lead = f"In '{name}' pieces of a rigid tissue do not move as one body, and lie apart after its motion: "
+        text = listing(lead, off, ". Give each bone a tissue of its own.")
+        findings.append(Finding("several-bodies", text, place=f"in '{name}' ({some(off, most=2)})"))
     round_ones = [bone for bone, fit in alignment.tissues.items() if len(fit.undetermined)]
     if round_ones:
-        text = (
-            f"the surface of {_quoted(round_ones)} does not show all of its rotation from 'before' to '{name}', and is"
-            " taken as not turning where it does not; join it to a bone that it moves with, if there is one"
+        rest = (
+            f" is too round to show its rotation from 'before' to '{name}' about every axis; that rotation is taken as"
+            " zero. Join it to a bone that it moves with, if there is one."
         )
-        findings.append(Finding("rotation-undetermined", text, place=f"to '{name}' ({_quoted(round_ones)})"))
+        text = listing("The surface of ", _quoted(round_ones), rest)
+        findings.append(
+            Finding("rotation-undetermined", text, place=f"to '{name}' ({some(_quoted(round_ones), most=2)})")
+        )
     return findings
 
 
-def _quoted(names: Sequence[str]) -> str:
-    return ", ".join(f"'{name}'" for name in names)
+def _quoted(names: Sequence[str]) -> list[str]:
+    return [f"'{name}'" for name in names]

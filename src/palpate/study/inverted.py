@@ -63,8 +63,8 @@ def inverted(
         if change < SETTLED:
             return found
     raise NotConverged(
-        f"moduli and the reference's state without loads do not settle: after {PASSES} passes moduli still change by"
-        f" {100.0 * change:.2g} %; check the loads of state 0, or state the increment of loads instead"
+        f"the moduli and the stress-free reference state do not converge: after {PASSES} passes moduli still change by"
+        f" {100.0 * change:.2g} %; check the loads of state 0, or state only the change of the loads"
     )
 
 

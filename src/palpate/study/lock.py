@@ -19,7 +19,7 @@ if sys.platform != "win32":
 
 NAME = ".palpate.lock"
 FLAGS = ("O_CREAT", "O_APPEND", "O_NOFOLLOW", "O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC")  # Windows lacks some
-NO_FILE = "is no regular file of that folder alone (a link, a pipe, a folder ...) and is left alone: remove it"
+NO_FILE = "is not a regular file of that folder (but a link, a pipe or a folder): remove it"
 
 
 @contextmanager

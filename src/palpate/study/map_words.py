@@ -1,4 +1,4 @@
-"""What a map of stiffness says, in words: where a tissue differs, that nothing in it does, or that it cannot tell."""
+"""A map of stiffness in words: a part differs, no part differs, or the data cannot tell."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def map_words(of: StiffnessMap) -> str:
 
 
 def map_findings(maps: Sequence[StiffnessMap]) -> tuple[Finding, ...]:
-    """Of every map that shows what was believed rather than what was seen."""
+    """A finding for every map that shows the prior rather than the data."""
     return tuple(
         Finding(
             "map-of-prior",
-            f"the map of '{of.tissue}' is mostly what was believed of it: the data removed {of.resolved:.0%} of the"
-            " variance of ln E inside it; use the tissue's mean, or give a displacement field ([[data]])",
+            f"The map of '{of.tissue}' shows mostly the prior: the data removed only {of.resolved:.0%} of the prior's"
+            " variance of ln E inside it. Use the tissue's mean, or give a displacement field ([[data]]).",
         )
         for of in maps
         if of.resolved < RESOLVED

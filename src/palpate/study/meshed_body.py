@@ -76,7 +76,8 @@ def with_prescribed(states: ImagedStates, case: Case) -> ImagedStates:
         points = [of for of in states.data if isinstance(of, MeasuredPoints) and of.file.state == state]
         if not points:
             raise ConfigurationError(
-                f"'{surfaces[0]}' is prescribed, and no [[data]] of state {state} says where points went; measure some"
+                f"'{surfaces[0]}' is prescribed, and no [[data]] of state {state} says where its points moved; add such"
+                " data"
             )
         motion = MeasuredMotion(points, case.driver.kernel_mm, case.driver.prior_mm)
         for name in surfaces:
@@ -90,16 +91,18 @@ def _findings(file: MeshFile, case: Case) -> tuple[Finding, ...]:
     found, length = list[Finding](), float(np.ptp(file.nodes, axis=0).max())
     if not USUAL_MM[0] <= length <= USUAL_MM[1]:
         unit, factor = ("metres", 1e3) if length < USUAL_MM[0] else ("micrometres", 1e-3)
-        text = f"the mesh is {length:.3g} mm long; if it was written in {unit}, multiply its coordinates by {factor:g}"
+        text = f"The mesh is {length:.3g} mm long. If it was written in {unit}, multiply its coordinates by {factor:g}"
         wide = [s.name for s in case.surfaces if s.where in PLANES and s.within_mm > 0.5 * length]
         if wide:
-            raise InputDataError(f"{text}; else make within_mm of '{wide[0]}' smaller, which takes all of the mesh")
-        found.append(Finding("units", text))
+            raise InputDataError(
+                f"{text}; else make within_mm of '{wide[0]}' smaller, which now includes the whole mesh"
+            )
+        found.append(Finding("units", f"{text}."))
     if len(count := np.bincount(file.piece)) > 1:
         place = np.round(file.nodes[file.tets[file.piece == count.argmin()]].mean(axis=(0, 1)), 1).tolist()
         text = (
-            f"the mesh has {len(count)} pieces that share no face, the largest of {count.max()} tetrahedra, the"
-            f" smallest of {count.min()} around {place} mm: no stress passes between them; join what is one body"
+            f"The mesh has {len(count)} pieces that share no face, so no stress passes between them; the smallest has"
+            f" {count.min()} tetrahedra near {place} mm. Join the pieces that belong together."
         )
         found.append(Finding("islands", text))
     return tuple(found)
@@ -134,11 +137,13 @@ def _regions(file: MeshFile, case: Case) -> tuple[list[Tissue], NDArray[np.int64
         tissue = tissues[number]
         if not tissue.meshed:
             raise ConfigurationError(
-                f"tissue '{tissue.name}' is {tissue.role}, and a mesh holds solid ones alone: name it in [[surfaces]]"
+                f"tissue '{tissue.name}' is {tissue.role}, but a mesh holds only solid tissues: name it in [[surfaces]]"
             )
         own = np.flatnonzero(region < 0) if last[number] else _tets(file, case.tissues[number])
         if not len(own):
-            raise ConfigurationError(f"tissue '{tissue.name}' has no tetrahedron: the others have all; leave it out")
+            raise ConfigurationError(
+                f"tissue '{tissue.name}' has no tetrahedron, because the other tissues have all; remove it"
+            )
         if len(twice := region[own[region[own] >= 0]]):
             both = f"'{tissues[twice[0]].name}' and '{tissue.name}'"
             raise ConfigurationError(f"{len(twice)} tetrahedra are in groups of {both}; give each to one tissue")
@@ -146,8 +151,8 @@ def _regions(file: MeshFile, case: Case) -> tuple[list[Tissue], NDArray[np.int64
     if len(left := np.flatnonzero(region < 0)):
         groups = sorted(str(name) for name, own in file.groups.items() if np.isin(own, left).any())
         raise ConfigurationError(
-            f"no tissue of the case has {len(left)} of the tetrahedra, which are in the group(s) {groups}; give them"
-            ' one, or the label "remaining"'
+            f"{len(left)} tetrahedra belong to no tissue; they are in the group(s) {groups}. Give these groups to a"
+            ' tissue, or give one tissue the label "remaining"'
         )
     return tissues, region
 

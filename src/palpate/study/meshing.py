@@ -1,4 +1,4 @@
-"""The reference state of a case meshed: with the case's edge length, or a shorter one where that mesh is not fit."""
+"""The mesh of a reference state, with the case's edge length or a shorter one where that mesh fails its check."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def mesh_reference(
 ) -> ReferenceMesh:
     """Mesh `before` as far as it goes, or the case's margin, with the edge length of `edge_length_of`.
 
-    A mesh that fails its gate, or that Mmg gives up, is followed by one of 0.75 times the edge length, at most twice
-    and where this machine has the memory for an estimate on it; the finding "finer-mesh" tells of it. Raises
+    A mesh that fails its quality check, or that Mmg gives up, is followed by one of 0.75 times the edge length. This is
+    done at most twice, and only if the memory suffices for an estimate on it; the finding "finer-mesh" says so. Raises
     `GeometryError` when none is fit, `ResourceError` where the mesher stops for want of memory.
     """
     box = case_domain(before, case)
@@ -61,7 +61,7 @@ def mesh_reference(
         if lack:
             raise GeometryError(f"{failure}; a mesh of {edge:g} mm was not tried: {lack}") from failure
         lengths = edge_length_of(finer, before, after) if failure else chosen
-        why = f"because the mesh before was not fit: {failure}" if failure else chosen.in_words
+        why = f"because the previous mesh failed: {failure}" if failure else chosen.in_words
         progress(f"meshing at {edge:g} mm, {why}")
         try:
             mesh, quality = _fit_mesh(before, anatomy, lengths, progress)
@@ -71,16 +71,16 @@ def mesh_reference(
         if failure is None:
             return ReferenceMesh(mesh, quality, chosen)
         text = (
-            f"the mesh has edges of {edge:g} mm, for a coarser one was not fit to compute with: {failure}. With"
-            f" mesh.edge_length_mm = {edge:g} in place of {asked:g} the attempt is saved; a repair of the labels at"
-            " that place may allow coarser meshes"
+            f"A mesh with edges of {asked:g} mm failed its quality check, so one with edges of {edge:g} mm is used. The"
+            f" results are not affected; set mesh.edge_length_mm = {edge:g} to save the attempt (log.txt says what"
+            " failed)."
         )
-        lengths = replace(lengths, reason=f"a mesh of {asked:g} mm was not fit")
-        return ReferenceMesh(mesh, quality, lengths, (Finding("finer-mesh", text),))
+        lengths = replace(lengths, reason=f"a mesh of {asked:g} mm failed its quality check")
+        return ReferenceMesh(mesh, quality, lengths, (Finding("finer-mesh", text, place=f"with {edge:g} mm"),))
     raise type(failure or GeometryError())(
-        f"no mesh is fit to compute with, neither at mesh.edge_length_mm = {asked:g} nor at"
-        f" {' and '.join(f'{edge:g}' for edge in edges[1:])} mm, where {failure}; repair the labels at that place, or"
-        " try another edge length"
+        f"no mesh passes its quality check, neither with mesh.edge_length_mm = {asked:g} nor with"
+        f" {' and '.join(f'{edge:g}' for edge in edges[1:])} mm. With the last one, {failure}. Correct the labels at"
+        " that place, or try another edge length"
     ) from failure
 
 
@@ -88,7 +88,7 @@ def refuse_edge(edge_mm: float, box: Box) -> None:
     """Raise `GeometryError` for an edge length that the domain has no room for."""
     if edge_mm >= float(box.lengths.min()):
         raise GeometryError(
-            f"mesh.edge_length_mm is {edge_mm}; it must be positive and less than the smallest side of the domain,"
+            f"mesh.edge_length_mm is {edge_mm} mm; it must be less than the smallest side of the domain,"
             f" {box.lengths.min():.1f} mm"
         )
 
@@ -101,8 +101,8 @@ def _fit_mesh(
         mesh = tetrahedralise(anatomy, edge_length_mm=lengths.mm, longer_mm=lengths.longer_mm, progress=progress)
     except RuntimeError as error:  # Mmg's own words, which do not tell a lack of memory from a bad surface
         raise ResourceError(
-            f"the mesher stopped ({error}), most likely for want of memory; make mesh.edge_length_mm larger, or the"
-            ' domain smaller (domain.extent = "margin")'
+            f"the mesher stopped ({error}), most likely because memory ran out; make mesh.edge_length_mm larger, or"
+            ' the domain smaller (domain.extent = "margin")'
         ) from error
     progress("checking the quality of the mesh")
     # voxels of each tissue, a layer of the image at a time, by their share inside: exact for a box along the grid

@@ -1,4 +1,4 @@
-"""What a fitted model misses by more than noise explains: of each surface, each kind of points, each force."""
+"""Data that the fitted model misses by more than their noise explains: surfaces, points and forces."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Misfit:
 def misfits_of(
     lines: Sequence[Linearisation], points: Sequence[PointFit], tissues: Sequence[Tissue]
 ) -> tuple[Misfit, ...]:
-    """Those of all data of a fit; points: measured and fitted motions, in the order of `lines`.
+    """The misfits of all data of a fit; points: measured and fitted motions, in the order of `lines`.
 
     Of the surfaces those of `tissues` that are meshed: the modes of a driver follow its wall, and a hollow tissue is
     seen where no mesh is beside it, too, so that parts of it in the image belong to nothing.
@@ -109,9 +109,9 @@ def _of_points(line: Linearisation, motions: PointMotions) -> Misfit | None:
         times, by = float(sizes[worst]), float(np.linalg.norm(left[worst]))
         short = f"{far} of {n} points of {what} by up to {times:.2g} times their stated error"
         text = (
-            f"the fitted model misses {far} of {n} points of {what} far beyond their stated error of {sd:.2g} mm, most"
-            f" of all {which}: by {by:.2g} mm, {times:.2g} times what that explains. Are they the same points"
-            " in both states, or of a part that moves otherwise? Correct them, or take them out"
+            f"The fitted model misses {far} of {n} points of {what}, most of all {which} by {by:.2g} mm, {times:.2g}"
+            f" times what the stated error of {sd:.2g} mm explains. Check that they are the same points in both states;"
+            " correct or remove them."
         )
         return Misfit(name, line.state, times, short, text, whole=False)
     if smooth[0] > max(times, limit):
@@ -121,11 +121,11 @@ def _of_points(line: Linearisation, motions: PointMotions) -> Misfit | None:
     words = "".join(axis for axis, cosine in zip(AXES, along, strict=True) if cosine > ALONG)
     words = words or f"({', '.join(f'{cosine:.2f}' for cosine in along)})"
     by = float(np.sqrt(np.mean((left @ along) ** 2)))
-    means = " in means of points that lie near each other" if by < 0.9 * times * sd else ""
+    means = " for means of neighbouring points" if by < 0.9 * times * sd else ""
     text = (
-        f"the fitted model misses {what} along {words} by {by:.2g} mm (root mean square), {times:.2g} times what the"
-        f" stated error of {sd:.2g} mm explains{means}. Check the file's state and axes; try another law or another"
-        " motion of the boundary; or state the error, and the length over which errors are alike, that you can show"
+        f"The fitted model misses {what} along {words} by {by:.2g} mm (root mean square), {times:.2g} times what the"
+        f" stated error of {sd:.2g} mm explains{means}. Check the file's state, its axes and its stated error; try"
+        " another law or boundary."
     )
     short = f"{what} along {words.split(' (')[0]} by {times:.2g} times its stated error"
     return Misfit(name, line.state, times, short, text)
@@ -135,9 +135,9 @@ def _of_surface(line: Linearisation, seen: Imaged) -> Misfit | None:
     """That of a surface, beside the noise that is stated or that all of the image show, voxels' rounding at least."""
     observation, of = line.observation, line.residuals
     name, sd = observation.name, observation.first_noise((observation,)).sd
-    noise = "that is stated"
+    noise = "stated"
     if seen.stated_noise is None:
-        sd, noise = max(sd, observation.weighting.sd), "that the image shows"
+        sd, noise = max(sd, observation.weighting.sd), "estimated"
     shares, fit, n = of.weights / of.weights.sum(), observation.fit(of), observation.weighting.count
     usual = float(np.sqrt(chi2.isf(TAIL, 1))) * sd
     far = float(shares[np.abs(of.values) > RELEVANT * usual].sum())
@@ -145,10 +145,9 @@ def _of_surface(line: Linearisation, seen: Imaged) -> Misfit | None:
         return None
     times, what = max(fit.rms_mm / sd, fit.hd95_mm / usual), f"the surface of '{name}' in state {line.state + 1}"
     text = (
-        f"the fitted model misses {what} by {fit.rms_mm:.2g} mm (root mean square) and {TAIL:.0%} of it by"
-        f" {fit.hd95_mm:.2g} mm or more, {times:.2g} times what the noise of {sd:.2g} mm {noise} explains. Look at it"
-        " in the report: is it drawn otherwise there? Or does the model lack what moves it: another law or boundary, a"
-        " part that slides?"
+        f"The fitted model misses {what} by {fit.rms_mm:.2g} mm (root mean square; 95th percentile {fit.hd95_mm:.2g}"
+        f" mm), {times:.2g} times what the {noise} noise of {sd:.2g} mm explains. Look at it in the report: check how"
+        " it is drawn, and try another law or boundary."
     )
     return Misfit(name, line.state, times, f"{what} by {times:.2g} times its noise", text)
 
@@ -162,9 +161,9 @@ def _of_instrument(line: Linearisation, seen: OfInstrument) -> Misfit | None:
         return None
     what = f"the {observation.name} in state {line.state + 1}"
     text = (
-        f"the fitted model needs {seen.measured + left:.3g} {unit} for {what}, where {seen.measured:.3g} {unit} was"
-        f" measured: {times:.2g} times the stated error of {sd:.2g} {unit} lies between. Check its unit, its direction"
-        " and its surface, or state a larger error"
+        f"The fitted model needs {seen.measured + left:.3g} {unit} for {what}, but {seen.measured:.3g} {unit} was"
+        f" measured, which differs by {times:.2g} times the stated error of {sd:.2g} {unit}. Check its unit, direction"
+        " and surface, or state a larger error."
     )
     return Misfit(observation.name, line.state, times, f"{what} by {times:.2g} times its stated error", text)
 

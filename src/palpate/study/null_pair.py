@@ -133,8 +133,8 @@ def noise_of_drawings(first: LabelImage, second: LabelImage, *, align: str = "au
         seen.append((tissue.name, residual, surface))
     if not seen:
         raise InputDataError(
-            f"no organ shows {LEAST_POINTS} points of its surface in both images, away from their borders: enlarge the"
-            " images, or use finer ones"
+            f"no organ shows {LEAST_POINTS} points of its surface in both images, away from their borders: use larger"
+            " or finer images"
         )
     surfaces = [surface for _, _, surface in seen]
     centre = np.average(np.concatenate([s.places for s in surfaces]), axis=0)

@@ -62,16 +62,16 @@ def ratio_verdict(interval: Interval, *, at_bound: bool, of_prior: float) -> tup
     """
     low, high = interval
     if at_bound:
-        return NOT_IDENTIFIED, "the estimate lies at the end of the search; the images do not hold it back"
+        return NOT_IDENTIFIED, "the estimate lies at the end of the search range; the data do not limit it"
     if of_prior >= BELIEVED:
-        return NOT_IDENTIFIED, "the interval is that of the stated prior: the images add little to it"
+        return NOT_IDENTIFIED, "the interval is that of the stated prior; the data add little to it"
     if low is None or high is None:
-        return NOT_IDENTIFIED, "the 95 % interval is open: it reaches beyond the ends of the search"
+        return NOT_IDENTIFIED, "the 95 % interval is open: it reaches beyond the search range"
     width = f"the 95 % interval is {high - low:.2g} wide"
     if high - low > WEAK:
         return NOT_IDENTIFIED, width
     if high - low > IDENTIFIED:
-        return "weak", f"{width}; a larger motion, or poisson_ratio_sd where something is known, narrows it"
+        return "weak", f"{width}; a larger motion, or a known poisson_ratio_sd, narrows it"
     return "identified", width
 
 

@@ -104,10 +104,9 @@ class Background:
         if self.seen:
             return f"{of} is air around the body for {self.outside:.1%} of its volume, by the CT; the rest is tissue"
         return (
-            f"{of} is taken for tissue of the body throughout, and {self.outside:.0%} of its volume lies beyond the"
-            " convex hull of all labels, where no label tells tissue from air. Air that is taken for tissue holds the"
-            " organs as tissue would: give the CT (palpate init ... --ct CT), or label the body (TotalSegmentator's"
-            " task body) in all images"
+            f"{of} is taken as tissue, and {self.outside:.0%} of its volume lies outside the convex hull of all labels,"
+            " where it may be air. Air taken as tissue would hold the organs: give the CT (palpate init ... --ct CT),"
+            " or label the body (TotalSegmentator's task body) in all images"
         )
 
 

@@ -37,7 +37,7 @@ def input_digests(case: Case, *pairs: Mapping[str, str]) -> dict[str, str]:
     for digests in pairs:
         for key, digest in digests.items():
             if found.setdefault(key, digest) != digest:
-                raise InputDataError(f"the file of '{key}' was changed while the case was read; run it again")
+                raise InputDataError(f"the file of '{key}' was changed while the case was read; run the command again")
     images = case.images
     if images is None:
         return found

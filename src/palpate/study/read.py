@@ -121,7 +121,7 @@ def phantom_scene(case: Case) -> Scene:
         role = own[tissue.name].role
         if tissue.role is not role or tissue.label != tissue.name:
             raise ConfigurationError(
-                f"the phantom's tissue '{tissue.name}' has the role {role} and that name for its label; the case cannot"
+                f"the phantom's tissue '{tissue.name}' has the role {role} and its own name as label; the case cannot"
                 f" give it the role {tissue.role} and the label {shown(tissue.label)}"
             )
     meshed = tuple(tissue for tissue in case.tissues if own[tissue.name].meshed)

@@ -1,4 +1,4 @@
-"""What no estimate can begin with (nothing that moves, organs too small, thin or lost), and where its law ends."""
+"""Cases that no estimate can start from (no motion; organs too small, thin or lost); the range of the linear law."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ ORGANS, MESHED = (Role.ESTIMATE, Role.DRIVER), (Role.ESTIMATE, Role.KNOWN)
 LINEAR_RANGE = 0.10  # principal strain beyond which the neglected squares are over a tenth of it
 MOST_BEYOND = 0.01  # largest share of the meshed volume with larger strains
 NOTHING_MOVES = (
-    'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), and no load or'
-    " force is known, so no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the"
-    ' others, a surface of a mesh the boundary "moving" or "prescribed", or state a load'
+    "nothing moves this body: no tissue has the role driver, no rigid tissue moves, and no load or force is known, so"
+    " no modulus can be estimated. Give the role driver to the hollow organ whose wall deforms the others, give a"
+    ' surface of a mesh the boundary "moving" or "prescribed", or state a load'
 )
 MOVES_MM = 1e-6  # less is rounding
 
 
 def refuse_what_cannot_be_estimated(case: Case) -> None:
-    """Say before any image is read what no image mends: `ConfigurationError`.
+    """Raise `ConfigurationError`, before any image is read, for a case that no image can make right.
 
-    There is no later state, nothing can move, or a load or force acts on a surface that the case has not.
+    There is no later state, nothing can move, or a load or force acts on a surface that does not exist.
     """
     if case.images is not None and not case.images.after:
         raise ConfigurationError(
@@ -45,8 +45,7 @@ def refuse_what_cannot_be_estimated(case: Case) -> None:
         )
     if case.estimate.method != "gauss-newton":
         raise ConfigurationError(
-            f"[estimate] method = '{case.estimate.method}' is none: write 'gauss-newton', which ends at the same"
-            " minimum, or leave the key out"
+            f"[estimate] method = '{case.estimate.method}' is unknown: write 'gauss-newton', or remove the key"
         )
     movers = [tissue for tissue in case.tissues if tissue.role in (Role.DRIVER, Role.RIGID)]
     if case.tissues and case.images is not None and not movers and not case.loads and not case.data:
@@ -87,14 +86,14 @@ def refuse_unmeshable(segmentation: Segmentation, name: str) -> None:
         count = int(np.count_nonzero(mask))
         if count < SMALL_VOXELS:
             raise GeometryError(
-                f"'{tissue.name}' has only {count} voxels in '{name}', and {SMALL_VOXELS} are the least that a"
-                " surface can be made of: use finer images, or join it to its neighbour"
+                f"'{tissue.name}' has only {count} voxels in '{name}', and a surface needs at least {SMALL_VOXELS}: use"
+                " finer images, or join it to its neighbour"
             )
         box = window_around(mask, segmentation.grid)
         if not ndimage.binary_erosion(mask[box], np.ones((2, 2, 2), dtype=bool)).any():
             raise GeometryError(
-                f"'{tissue.name}' is nowhere two voxels thick in '{name}' ({count} voxels); such a sheet has no inside"
-                " to be meshed: use finer images, or join it to its neighbour"
+                f"'{tissue.name}' is nowhere two voxels thick in '{name}' ({count} voxels), too thin to be meshed: use"
+                " finer images, or join it to its neighbour"
             )
 
 
@@ -103,9 +102,9 @@ def refuse_large(segmentation: Segmentation, path: Path) -> None:
     needed, has = image_memory_gb(segmentation, n_images=2), machine_memory_gb()
     if has is not None and needed > has:
         raise ResourceError(
-            f"'{path}' has {' x '.join(map(str, segmentation.grid.shape))} voxels: a pair of such images and the"
-            f" distances to its organs would take about {needed:.1f} GB of memory, and this machine has {has:.1f} GB;"
-            " crop the images to the organs, or resample the labels to larger voxels"
+            f"'{path}' has {' x '.join(map(str, segmentation.grid.shape))} voxels: a pair of such images and its"
+            f" distance maps needs about {needed:.1f} GB of memory, and this machine has {has:.1f} GB; crop the images"
+            " to the organs, or resample the labels to larger voxels"
         )
 
 
@@ -122,7 +121,7 @@ def refuse_lost(before: Segmentation, after: Segmentation, name: str) -> None:
         if abs(change) > VOLUME_IMPLAUSIBLE and not (_cut(before, i) or _cut(after, i)):
             raise InputDataError(
                 f"the volume of '{tissue.name}' changes by {change:+.1%} from 'before' ({before.volume(i) / 1e3:.4g}"
-                f" mL) to '{name}' ({after.volume(i) / 1e3:.4g} mL), which no deformation of one organ does: check"
+                f" mL) to '{name}' ({after.volume(i) / 1e3:.4g} mL), too much for a deformation of one organ: check"
                 " that the label means the same in both images, or give a hollow organ the role driver"
             )
         shift = float(np.linalg.norm(after.middle(i) - before.middle(i)))
@@ -166,9 +165,8 @@ def linear_strain_warnings(
     return (
         Finding(
             "linear-strains",
-            f"{image}: {100 * share:.1f} % of the meshed volume strains by more than {100 * LINEAR_RANGE:.0f} % (99th"
-            f" percentile {100 * tail:.0f} %), beyond the range of the linear law, whose moduli can then be wrong by"
-            " tens of per cent and others when the images are exchanged, whatever their intervals; set [mechanics] law"
-            ' = "neo-hookean", with the state that is free of stress (the emptier one) as images.before',
+            f"In '{image}' {100 * share:.1f} % of the meshed volume strains by more than {100 * LINEAR_RANGE:.0f} %"
+            f" (99th percentile {100 * tail:.0f} %), so moduli by the linear law can be wrong by tens of per cent. Set"
+            " mechanics.law = \"neo-hookean\", with the state that is free of stress, the emptier one, as 'before'.",
         ),
     )

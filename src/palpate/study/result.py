@@ -113,13 +113,13 @@ class CaseResult:
 
     @property
     def displacements(self) -> tuple[NDArray[np.float64], ...]:
-        """Displacements (n_points, 3) mm of the first reference state, one a later state, imaged or not."""
+        """Displacements (n_points, 3) mm of the first reference state, one for each later state."""
         motions = self.estimation.displacements
         return motions[: len(motions) - sum(len(pair.displacements) for pair in self.further)]
 
     @property
     def all_remarks(self) -> tuple[Finding, ...]:
-        """Warnings of the study and of the estimation, one a cause, in the order of what they cost in the answer."""
+        """Warnings of the study and of the estimation, one for each cause, the most harmful first."""
         return one_a_cause((*self.remarks, *self.estimation.remarks))
 
     @property

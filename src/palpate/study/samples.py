@@ -1,4 +1,4 @@
-"""Samples of the moduli's posterior: chains around the estimate on the fast path, and whether they have mixed."""
+"""Samples of the moduli's posterior: Markov chains around the estimate, and whether they have mixed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ResourceError
-from palpate.findings import Finding
+from palpate.findings import Finding, listing
 from palpate.inversion import Bounds
 from palpate.study.case import SAMPLES, Case
 from palpate.study.stated_posterior import StatedPosterior
@@ -81,8 +81,8 @@ def require_samples(case: Case) -> None:
             import_module(name)
     except ImportError as error:
         raise ResourceError(
-            f"{POSTERIOR} is written by h5netcdf, which is not installed: pip install 'palpate[samples]'; without"
-            " --samples (with [estimate] samples = 0) the case is estimated all the same"
+            f"{POSTERIOR} is written by h5netcdf, which is not installed: pip install 'palpate[samples]'; the estimate"
+            " itself works without --samples ([estimate] samples = 0)"
         ) from error
 
 
@@ -130,15 +130,14 @@ def sample_findings(samples: ModulusSamples | None) -> tuple[Finding, ...]:
     if samples is None or samples.diagnostics.mixed.all():
         return ()
     found = samples.diagnostics
-    open_ = ", ".join(
-        f"{samples.tissues[i]} (R-hat {found.r_hat[i]:.3f}, {found.ess_bulk[i]:.0f} effective draws)"
+    open_ = [
+        f"'{samples.tissues[i]}' (R-hat {found.r_hat[i]:.3f}, {found.ess_bulk[i]:.0f} effective draws)"
         for i in np.flatnonzero(~found.mixed).tolist()
-    )
+    ]
     draws = samples.log_density.shape[1]
-    return (
-        Finding(
-            "samples-not-mixed",
-            f"the chains of {draws} draws have not mixed: {open_}, where R-hat may be 1.01 and 400 effective draws are"
-            f" needed; ask for more, --samples {min(4 * draws, SAMPLES[1])} for example. Estimates do not rest on them",
-        ),
+    rest = (
+        ", where R-hat should be at most 1.01 with 400 effective draws. The estimates do not use them; for better draws"
+        f" set --samples {min(4 * draws, SAMPLES[1])}."
     )
+    text = listing(f"The chains of {draws} draws have not mixed for ", open_, rest)
+    return (Finding("samples-not-mixed", text),)

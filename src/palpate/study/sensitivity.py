@@ -130,8 +130,8 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
     began, kept = time.perf_counter(), kept or Kept()
     if case.estimate.seeks_poisson_ratios:
         raise ConfigurationError(
-            "how the moduli depend on Poisson's ratios is part of what is shown here, and this case seeks them as"
-            ' unknowns: leave [estimate] parameters at ["youngs_modulus"]'
+            "a sensitivity study varies Poisson's ratios, but this case estimates them:"
+            ' leave [estimate] parameters at ["youngs_modulus"]'
         )
     if sobol:
         require_salib()
@@ -196,8 +196,8 @@ def _estimated(case: Case, bodies: Bodies, sobol: int, progress: Progress) -> di
     inversion, settings = _inverted(bodies, case, details(progress))
     if not inversion.minimum.converged:
         raise NotConverged(
-            f"the case itself has no estimate ({inversion.minimum.outcome.value}), so nothing can be said of what it"
-            " depends on; see what `palpate estimate` tells of it"
+            f"the case itself has no estimate ({inversion.minimum.outcome.value}), so its sensitivities are unknown;"
+            " see the warnings of `palpate estimate`"
         )
     later = tuple(image for body in bodies for image in body.states.after)
     observed = observed_of(inversion, bodies)
@@ -261,7 +261,7 @@ def _varied(
             made = _meshed(own, case, progress)
         edge = made[0].edge_length
         if variant.makes == "mesh" and edge and edge.mm != case.mesh.edge_length_mm:
-            raise GeometryError(f"no mesh of {variant.setting} is fit to compute with")
+            raise GeometryError(f"no mesh of {variant.setting} passes its quality check")
         inversion, settings = _inverted(made, case, progress, theta)
         if not inversion.minimum.converged:
             raise EstimationError(f"the estimate did not converge: {inversion.minimum.outcome.value}")

@@ -70,8 +70,8 @@ def surface_labels(
     """
     names = {file.stem: number for number, file in enumerate(files, start=1)}
     if len(names) < len(files) or not 0 < len(files) <= MOST_SURFACES:
-        flaw = f"{len(files)} surfaces are named, of {len(names)} names"
-        raise ConfigurationError(f"{flaw}; give 1 to {MOST_SURFACES} files of different names, those of the organs")
+        flaw = f"{len(files)} surfaces are given, with {len(names)} different names"
+        raise ConfigurationError(f"{flaw}; give 1 to {MOST_SURFACES} files with different names, one for each organ")
     surfaces = {file.stem: read_stl(file) for file in files}
     said = {surface.space: file for file, surface in zip(files, surfaces.values(), strict=True)}
     if axes is None and "" in said and len(said) > 1:
@@ -90,7 +90,7 @@ def surface_labels(
         affine[:3, 3] = low + 0.5 * spacing_mm
         grid = VoxelGrid((nx, ny, nz), affine)
     if (size := math.prod(grid.shape)) > MOST_VOXELS:
-        flaw = f"the grid would have {size:.3g} voxels, over {MOST_VOXELS}; take larger ones, or less margin"
+        flaw = f"the grid would have {size:.3g} voxels, over {MOST_VOXELS}; use larger voxels, or a smaller margin"
         raise ResourceError(flaw + next(filter(None, map(_other_unit, surfaces.values())), ""))
     volumes, findings = dict[str, tuple[float, float]](), list[Finding]()
 
@@ -108,7 +108,9 @@ def surface_labels(
     for name, number in names.items():
         if not left[number]:
             count = round(volumes[name][1] / grid.voxel_volume)
-            raise InputDataError(f"smaller organs claim all {count} voxels of '{name}'; is a surface named twice?")
+            raise InputDataError(
+                f"smaller organs claim all {count} voxels of '{name}'; check whether a surface is given twice"
+            )
     called = {number: name for name, number in names.items()}
     digests = {name: surface.digest for name, surface in surfaces.items()}
     return SurfaceLabels(LabelImage(labels, grid, called, {}, digests, (*findings, *overlaps)), volumes)
@@ -122,21 +124,27 @@ def _flaws(name: str, surface: SurfaceFile, count: int, grid: VoxelGrid) -> list
         low, high, first, end = (np.round(each, 3).tolist() for each in (*surface.ends, *grid.world(last * [[0], [1]])))
         raise InputDataError(
             f"'{name}' has {count} voxels: it holds {volume} from {low} to {high} mm (RAS), on a grid from {first} to"
-            f" {end} mm in voxels of {grid.spacing.max():.3g} mm"
-            f"{_other_unit(surface) or '; are its unit and its axes right (--scale, --axes)?'}"
+            f" {end} mm in voxels of {grid.spacing.max():.3g}"
+            f" mm{_other_unit(surface) or '; check its unit and its axes (--scale, --axes)'}"
         )
     found = []
     index = grid.index(surface.points)
     if counted < held and (np.abs(index - 0.5 * last) > 0.5 * last + 0.5).any():
-        text = f"the grid ends in '{name}': {1.0 - counted / held:.1%} of its {volume} lies beyond; take a larger image"
+        text = (
+            f"{1.0 - counted / held:.1%} of '{name}' ({volume}) lies outside the grid. Use a larger image as the grid."
+        )
         found.append(Finding("cut-by-border", text, name))
     elif abs(counted - held) > DOUBTFUL * held:
-        flaw = "pieces of it overlap, are in the file twice, or are turned inside out"
-        text = f"the triangles of '{name}' hold {volume}, its voxels {counted / 1000.0:.3g} mL: {flaw}"
-        found.append(Finding("overlap", f"{text}; make one surface of them where it was made", name))
+        text = (
+            f"The triangles of '{name}' enclose {volume}, but its voxels {counted / 1000.0:.3g} mL: pieces overlap,"
+            " occur twice, or are inside out. Join them to one surface in the program that made it."
+        )
+        found.append(Finding("overlap", text, name))
     pieces = int(igl.facet_components(surface.triangles)[0])
     if pieces > 1:
-        text = f"'{name}' has {pieces} closed pieces, which were taken for one organ; give each organ a file of its own"
+        text = (
+            f"'{name}' has {pieces} closed pieces, which were taken as one tissue. Give each tissue a file of its own."
+        )
         found.append(Finding("islands", text, name))
     return found
 

@@ -48,7 +48,7 @@ NAMES = {  # of a bar, by its cause; {} is the tissue
 VOXELS = (-0.5, -0.25, 0.25, 0.5)
 PRIOR_WIDTHS = (0.5, 2.0)
 ALL = "all tissues"
-DRAWN = "not moved, as how it is drawn is an unknown of the estimate: the interval holds it"
+DRAWN = "not varied: how it is drawn is an unknown of the estimate, so the interval includes it"
 
 
 @dataclass(frozen=True, slots=True)

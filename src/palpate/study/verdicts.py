@@ -17,7 +17,7 @@ from palpate.uncertainty import NORMAL_95, Covariance, Interval, ModulusInterval
 from palpate.unknowns import KNOWN_MODULUS, ratio_of_eta
 
 IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
-NOT_FOLLOWED = "the 95 % interval is open: it could not be followed from a minimum"
+NOT_FOLLOWED = "the 95 % interval is open: it could not be computed from a minimum"
 
 
 def hull(intervals: Sequence[Interval]) -> Interval:
@@ -36,7 +36,7 @@ def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str,
     """
     low, high = interval
     if at_bound:
-        return NOT_IDENTIFIED, "the estimate lies at its bound; the images do not hold it back"
+        return NOT_IDENTIFIED, "the estimate lies at its bound; the data do not limit it"
     if low is None or high is None:
         return NOT_IDENTIFIED, "the 95 % interval is open: it reaches beyond the bounds of the search"
     width = high / low
@@ -100,9 +100,9 @@ def estimates_of(
     *,
     truth: Mapping[str, float],
 ) -> tuple[ModulusEstimate, ...]:
-    """What is stated of the moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known.
+    """The estimates of moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known.
 
-    Where the covariance lacks what layers round organs would do, as the inversion is `unsettled`, nothing is
+    Where the inversion is `unsettled`, the covariance lacks the effect of layers around organs, and nothing is
     `identified`.
     """
     mapping, scale = inversion.objective.parameters, inversion.objective.parameters.scale_kpa
@@ -132,7 +132,7 @@ def estimates_of(
             word, why = or_as_ratio((word, why), by_ratio, at_bound=of.at_bound)
         if inversion.unsettled and word != NOT_IDENTIFIED:
             word = "weak" if word == "identified" else word
-            why = f"{why}, but does not hold what layers round the organs would do (warning `unsettled`)"
+            why = f"{why}, but leaves out the effect of layers around organs (warning `unsettled`)"
         points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)
         inside = log_interval(value, float(np.sqrt(given[i])), lower=low or 0.0, upper=high or np.inf)
         within = (inside[0] or low, inside[1] or high)
@@ -162,7 +162,7 @@ def or_as_ratio(found: tuple[str, str], by_ratio: Interval, *, at_bound: bool) -
     ratio_word, ratio_why = verdict(by_ratio, at_bound=at_bound, absolute=True)
     if found[0] == "identified" or ratio_word in (NOT_IDENTIFIED, found[0]):
         return found
-    return "ratio only", f"of the ratio {ratio_why}; the range of the known modulus leaves more of it open in kPa"
+    return "ratio only", f"of the ratio {ratio_why}; the range of the known modulus makes the interval in kPa wider"
 
 
 def without_scale(sd: float, interval: Interval, value: float, *, centre: float) -> Interval:

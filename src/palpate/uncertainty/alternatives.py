@@ -1,4 +1,4 @@
-"""What a covariance lacks where the images did not decide between alternatives of what is believed."""
+"""The covariance that is missing where the data did not decide between alternative priors."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class Covariance:
     """Of the parameters, (n_parameters, n_parameters) each, dimensionless, by its independent causes.
 
     Parameters are the log-moduli, then eta = ln(lambda / mu) of Poisson's ratios that are sought. noise: of the
-    residuals; prior: what is believed of all unknowns, of which `causes` are the parts by the cause of their block;
+    residuals; prior: that of all unknowns, of which `causes` are the parts by the cause of their block;
     grid: the place of the voxels, as far as it is not in noise that the residuals tell, which voxels round; mesh: what
     another mesh would make of it (of Young's moduli). given_model: all that would be left if frame, drawing and
     material were as the model has them, and only the drivers' motion unknown.

@@ -72,8 +72,8 @@ def posterior_chains(
         laplace = _Laplace(start, linalg.cholesky(evaluation.matrix / np.outer(slopes, slopes), lower=True))
     except linalg.LinAlgError as error:
         raise EstimationError(
-            f"the Gauss-Newton matrix is not positive definite ({error}): some modulus moves nothing at this place, so"
-            " its posterior cannot be sampled; start at a minimum"
+            f"the Gauss-Newton matrix is not positive definite ({error}): some modulus has no effect there, so its"
+            " posterior cannot be sampled; start at a minimum"
         ) from error
     with determined():
         own = np.linalg.cholesky(evaluation.covariance_columns(n)[:n])
@@ -198,8 +198,8 @@ def require_arviz() -> None:
         import_module("arviz_stats.base")
     except ImportError as error:
         raise ResourceError(
-            "whether samples have mixed is told by arviz-stats, which is not installed: pip install 'palpate[samples]';"
-            " without --samples (with [estimate] samples = 0) the case is estimated all the same"
+            "samples need arviz-stats, which is not installed: pip install 'palpate[samples]'; the estimate itself"
+            " works without --samples ([estimate] samples = 0)"
         ) from error
 
 

@@ -34,8 +34,8 @@ def require_salib() -> None:
         import_module("SALib")
     except ImportError as error:
         raise ResourceError(
-            "Sobol indices need SALib, which is not installed: pip install 'palpate[sensitivity]'; without --sobol the"
-            " sensitivities are computed all the same"
+            "Sobol indices need SALib, which is not installed: pip install 'palpate[sensitivity]'; the other"
+            " sensitivities work without --sobol"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""What is sought, and what is believed of it before the images are seen: log-moduli, and blocks of further unknowns."""
+"""The unknowns and their prior: log-moduli, and blocks of further unknowns."""
 
 from palpate.unknowns.blocks import FIELD as FIELD
 from palpate.unknowns.blocks import KNOWN_MODULUS as KNOWN_MODULUS

@@ -1,4 +1,4 @@
-"""Parameter blocks: groups of unknowns beside the moduli, each with what is believed of it before the images are seen.
+"""Parameter blocks: groups of unknowns beside the moduli, each with its prior.
 
 A block is one cause that a real pair of images brings: how a driver's wall moves, how the frame that the image cuts out
 of the body moves, how a surface is drawn, how a tissue's stiffness varies. The layers above ask a block what it acts on
@@ -44,7 +44,7 @@ LAYER_ODDS = -1.9  # log prior odds that layers differ from their tissue: those 
 class Acts(Enum):
     """What the unknowns of a block enter."""
 
-    BOUNDARY = "the displacement of what is prescribed"
+    BOUNDARY = "the displacement of prescribed points"
     MATERIAL = "the material of the elements"
     MODULI = "the logarithms of the moduli of regions"
     RESIDUALS = "the residuals of the observations, one unknown each"
@@ -68,7 +68,7 @@ class Block:
     left_out: variances of the first noise, a tenth of the found one, that what is left out of the unknowns may explain
     (see `informed_objective`); below 0 none is. regions: numbers of the model's regions whose moduli it multiplies, one
     unknown x for all of them, where it acts on moduli: a `share` s of each, in series with the rest of it, is e^x times
-    as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of what is believed where that is not normal;
+    as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of the prior where that is not normal;
     an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
     """
 
@@ -250,7 +250,7 @@ def layer_blocks(
 
     layers: of each organ its name, the numbers of the model's regions, and how thick its elements are there, h mm. The
     layer is t = `thickness_mm` of them, or all where these are thinner: a share min(t / h, 1). A capsule, a film
-    of fat or a plane on which an organ slides is hardly seen by its surface, while the organ's modulus hangs on it: as
+    of fat or a plane on which an organ slides is hardly seen by its surface, but the organ's modulus depends on it: as
     an unknown of the estimate it costs accuracy where there is none, and an interval that leaves it out does not hold
     where there is one.
     """

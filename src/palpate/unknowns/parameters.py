@@ -1,4 +1,4 @@
-"""From the unknowns to what a model takes of them, and what is believed of them before the images are seen."""
+"""The map from the unknowns to the parameters of a model, and the prior of the unknowns."""
 
 from __future__ import annotations
 
@@ -323,7 +323,8 @@ class ParameterMap:
             first = int(np.flatnonzero(wrong)[0])
             raise ConfigurationError(
                 f"the prior of ln E of '{self.names[first]}' has the mean {mean[first]} and the standard deviation"
-                f" {sd[first]}; give a number and a positive one (inf: no prior), or hold the modulus as a `known` one"
+                f" {sd[first]}; give a finite mean and a positive standard deviation (inf: no prior), or make the"
+                " modulus `known`"
             )
         return replace(self, prior_mean=np.where(np.isfinite(sd), mean, 0.0), prior_precision=np.diag(sd**-2.0))
 
@@ -366,7 +367,7 @@ def parameter_map(
         places = tuple(i for i, tissue in enumerate(meshed) if tissue.name == name)
         if len(places) != parts:
             raise ConfigurationError(
-                f"the Poisson's ratio of '{name}' is sought, but the model has {len(places)} moduli for it and not"
+                f"the Poisson's ratio of '{name}' is unknown, but the model has {len(places)} moduli for it and not"
                 f" {parts}: make it with `linear_model(..., open_poisson=...)` and with the same dilatation"
             )
         given = meshed[places[0]].poisson_ratio

@@ -121,12 +121,12 @@ def test_contours_of_sparser_or_finer_planes_make_slices_which_are_named(tmp_pat
     save_series(tmp_path / "ct", slices)
     square = np.array([[0, 9.5, 9.5], [0, 9.5, 19.5], [0, 29.5, 19.5], [0, 29.5, 9.5]])
     cases = (
-        ((2, 4, 6), 6, "2 at S 21, 27 mm interpolated; its planes every 6 mm"),
+        ((2, 4, 6), 6, "2 interpolated, at S = 21, 27 mm; contours every 6 mm"),
         (np.arange(2, 6.1, 0.5), 5, ""),
-        ((2.5, 3.5), 2, "1 at S 21 mm interpolated; its planes every 3 mm"),
+        ((2.5, 3.5), 2, "1 interpolated, at S = 21 mm; contours every 3 mm"),
         ((4,), 1, ""),
-        ((2, 3, 5, 6), 5, "1 at S 24 mm interpolated"),
-        ((2, 3, 4, 9, 10), 5, "4 at S 27, 30, 33, 36 mm left empty"),
+        ((2, 3, 5, 6), 5, "1 interpolated, at S = 24 mm"),
+        ((2, 3, 4, 9, 10), 5, "4 left empty, too far from the next, at S = 27, 30, 33 and 1 more mm"),
     )
     for planes, expected, words in cases:
         lines = [(np.add(square, [k, 0, 0]), "CLOSED_PLANAR") for k in planes]
@@ -149,8 +149,9 @@ def test_contours_that_enclose_nothing_are_left_out_and_warned_of(tmp_path: Path
     assert np.count_nonzero(image.labels) == 200
     (finding,) = image.findings
     assert finding.code == "open-contours"
-    assert "'prostate' (1 open and 2 of under 3 points and 1 in the file twice)" in finding.message
-    assert "'Blase ü' (none on this series)" in finding.message
+    assert "'prostate' (1 open and 2 with under 3 points and 1 twice in the file)" in finding.message
+    assert "'Blase ü' (none on this series) and 1 more" in finding.message
+    (finding,) = read_label_image(save_contours(tmp_path / "b.dcm", slices, NAMES, {1: lines, 3: below})).findings
     assert "'tumour' (100.0% of its points beyond the series and no voxel)" in finding.message
 
 
@@ -188,7 +189,9 @@ def test_names_that_stand_twice_series_without_uid_and_structures_of_another_ser
 def test_contours_without_their_slices_or_across_them_are_refused(tmp_path: Path) -> None:
     slices = series()
     path = save_contours(tmp_path / "a.dcm", slices, NAMES, {1: traced(masks()[1], 0.5)})
-    with pytest.raises(InputDataError, match=r"the DICOM series that '.*a\.dcm' was drawn on is not beside it"):
+    with pytest.raises(
+        InputDataError, match=r"the DICOM series on which '.*a\.dcm' was drawn is not in the same folder"
+    ):
         read_label_image(path)
     save_series(tmp_path / "ct", [*slices[:5], *slices[6:]])
     with pytest.raises(InputDataError, match=r"the 13 slices beside .* are no stack"):
@@ -196,7 +199,7 @@ def test_contours_without_their_slices_or_across_them_are_refused(tmp_path: Path
     save_series(tmp_path / "ct", slices[5:6])
     across = np.array([[2, 9, 9], [2, 9, 19], [5, 29, 19]])
     path = save_contours(tmp_path / "a.dcm", slices, NAMES, {1: [(across, "CLOSED_PLANAR")]})
-    with pytest.raises(InputDataError, match=r"'prostate' in .* runs over 3 slices"):
+    with pytest.raises(InputDataError, match=r"'prostate' in .* runs across 3 slices"):
         read_label_image(path)
     with pytest.raises(InputDataError, match="no structure with a contour"):
         read_label_image(save_contours(tmp_path / "a.dcm", slices, NAMES, {1: []}))
@@ -208,7 +211,7 @@ def test_a_link_to_a_series_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "ct").symlink_to(tmp_path / "ct")
     path = save_contours(tmp_path / "mine" / "a.dcm", slices, NAMES, {1: traced(masks()[1], 0.5)})
-    with pytest.raises(InputDataError, match="is not beside it"):
+    with pytest.raises(InputDataError, match="is not in the same folder"):
         read_label_image(path)
 
 

@@ -78,7 +78,7 @@ def test_a_contested_voxel_goes_to_the_smaller_organ_and_is_counted(tmp_path: Pa
     assert {name[2:]: n for name, n in by_name(image).items()} == {"tumour": 20, "gland": 60, "body": 40}
     (finding,) = image.findings
     assert finding.code == "overlap"
-    assert finding.message.startswith("20 voxels are claimed by several organs")
+    assert finding.message.startswith("20 voxels belong to several masks")
     assert "body" not in finding.message
 
 
@@ -113,7 +113,7 @@ def test_masks_that_cannot_be_are_refused_with_their_names_and_numbers(tmp_path:
     with pytest.raises(InputDataError, match="two masks of 'a'"):
         read_label_image(tmp_path / "twice")
     (tmp_path / "none").mkdir()
-    with pytest.raises(InputDataError, match="has 0 masks"):
+    with pytest.raises(InputDataError, match="holds 0 masks"):
         read_label_image(tmp_path / "none")
 
 
@@ -121,7 +121,7 @@ def test_counts_are_limited(tmp_path: Path) -> None:
     folder = save(tmp_path / "masks", a=box(0, 1))
     for number in range(mask_folder.MOST_MASKS):
         os.link(folder / "a.nii.gz", folder / f"{number}.nii.gz")
-    with pytest.raises(InputDataError, match="has 501 masks"):
+    with pytest.raises(InputDataError, match="holds 501 masks"):
         read_label_image(folder)
     for number in range(mask_folder.MOST_FILES - mask_folder.MOST_MASKS):
         (folder / f"{number}.txt").touch()
@@ -134,7 +134,7 @@ def test_no_link_is_followed_out_of_the_folder(tmp_path: Path) -> None:
     (folder / "b.nii.gz").symlink_to(folder / "a.nii.gz")
     assert by_name(read_label_image(folder))["b"] == 0  # all of its voxels are a's, too
     (folder / "c.nii.gz").symlink_to(other / "a.nii.gz")
-    with pytest.raises(InputDataError, match=r"c\.nii\.gz' is a link that leads out of its folder"):
+    with pytest.raises(InputDataError, match=r"c\.nii\.gz' is a link to a file outside its folder"):
         read_label_image(folder)
     (folder / "c.nii.gz").unlink()
     os.mkfifo(folder / "d.nii.gz")
@@ -146,7 +146,7 @@ def test_a_segmentation_among_masks_and_a_folder_of_grey_images_are_refused(tmp_
     folder = save(tmp_path / "masks", a=box(0, 1))
     head = "NRRD0004\ntype: uchar\ndimension: 3\nspace: RAS\nsizes: 2 2 2\nspace directions: (1,0,0) (0,1,0) (0,0,1)\n"
     (folder / "b.seg.nrrd").write_bytes(f"{head}encoding: raw\nSegment0_Name:=x\n\n".encode() + b"\1" * 8)
-    with pytest.raises(InputDataError, match="names of 1 segments of its own"):
+    with pytest.raises(InputDataError, match="has 1 named segments"):
         read_label_image(folder)
     with pytest.raises(InputDataError, match="is a folder, not a grey image"):
         readers.read_intensities(folder)

@@ -234,9 +234,11 @@ def test_labels_that_the_header_scales_are_named_as_such(tmp_path: Path) -> None
     image = read_label_image(scaled(2.0))
     assert np.array_equal(image.labels, 2 * labels())
     assert [finding.code for finding in image.findings] == ["scaled-labels"]
-    assert "scl_slope 2 and scl_inter 0" in image.findings[0].message
+    assert "scl_slope = 2 and scl_inter = 0" in image.findings[0].message
     for slope, intercept, words in ((0.3, 0.0, "not integers"), (1.0, -1.0, "from -1"), (2e4, 0.0, "0 to 80000")):
-        with pytest.raises(InputDataError, match=f"{words}.*scaled.*scl_slope {slope:g} and scl_inter {intercept:g}"):
+        with pytest.raises(
+            InputDataError, match=f"{words}.*scales.*scl_slope = {slope:g} and scl_inter = {intercept:g}"
+        ):
             read_label_image(scaled(slope, intercept))
     for slope in (0.0, 1.0):
         assert read_label_image(scaled(slope)).findings == ()
@@ -415,7 +417,7 @@ def test_a_gzip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
     """Its end is missing: whoever unpacked three of its fifty million bytes would come upon that."""
     path = raw(tmp_path / "a.nii.gz", tail=bytes(50_000_000))
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 3 // 50])
-    with pytest.raises(InputDataError, match="goes on for more than"):
+    with pytest.raises(InputDataError, match="has more than"):
         read_label_image(path)
 
 

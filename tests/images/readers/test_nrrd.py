@@ -274,7 +274,7 @@ def test_a_cut_or_endless_stream_is_refused(tmp_path: Path) -> None:
         with pytest.raises(InputDataError, match=words):
             read_label_image(write(tmp_path / "a.nrrd", head + body))
     bomb = gzip.compress(labels().tobytes(order="F") + bytes(50_000_000))
-    with pytest.raises(InputDataError, match="goes on for more than"):
+    with pytest.raises(InputDataError, match="has more than"):
         read_label_image(write(tmp_path / "a.nrrd", head + bomb))
     with pytest.raises(InputDataError, match="cannot hold"):
         read_label_image(write(tmp_path / "a.nrrd", header(encoding="gzip", sizes="800 800 800") + packed))

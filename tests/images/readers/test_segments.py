@@ -175,7 +175,7 @@ def test_overlapping_layers_are_refused_with_the_names_and_the_count(tmp_path: P
 
 def test_layers_of_floats_are_refused(tmp_path: Path) -> None:
     path = save(tmp_path / "a.seg.nrrd", organs().astype(np.float32), entries((0, 1, 2), (1, 1, 1)))
-    with pytest.raises(InputDataError, match="no labels"):
+    with pytest.raises(InputDataError, match="not labels"):
         read_label_image(path)
 
 

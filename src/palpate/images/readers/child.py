@@ -39,7 +39,7 @@ def main(request: str) -> None:
         except PalpateError as error:
             _send(pipe, {"error": type(error).__name__, "message": str(error)})
         except MemoryError:
-            advice = f"'{path}' does not fit into the memory that reading may take; crop the image to the organs"
+            advice = f"'{path}' needs more memory than a reader may use; crop the image to the organs"
             _send(pipe, {"error": "ResourceError", "message": advice})
         except Exception as error:
             flaw = f"the reader of '{path}' failed ({type(error).__name__}: {error})"

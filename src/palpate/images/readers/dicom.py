@@ -49,7 +49,7 @@ def read_dicom(path: Path, grid: VoxelGrid | None = None) -> StoredImage:
     except (PalpateError, MemoryError):
         raise
     except Exception as error:  # whose words may quote a patient's data
-        flaw = f"is no DICOM segmentation that can be read ({type(error).__name__})"
+        flaw = f"is a DICOM segmentation that cannot be read ({type(error).__name__})"
         raise InputDataError(f"'{path}' {flaw}; export it again") from error
     return image
 
@@ -57,7 +57,7 @@ def read_dicom(path: Path, grid: VoxelGrid | None = None) -> StoredImage:
 def refused_series(path: Path) -> InputDataError:
     """The sentence for DICOM that holds no segmentation."""
     return InputDataError(
-        f"'{path}' is a DICOM image or series, which is not read: convert it to NIfTI with dcm2niix or 3D Slicer,"
+        f"'{path}' is a DICOM image or series, not a segmentation: convert it to NIfTI with dcm2niix or 3D Slicer,"
         " segment it, and name the segmentation (a DICOM-SEG or an RTSTRUCT by its file)"
     )
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydicom.dataset import Dataset
 
 from palpate.errors import InputDataError
-from palpate.findings import Code, Finding
+from palpate.findings import Code, Finding, listing, some
 from palpate.images.label_image import LPS_TO_RAS, VoxelGrid
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, NamedLabel, given_name, hex_colour
 from palpate.images.readers.dicom_dataset import read_dataset, series_beside
@@ -25,11 +25,11 @@ from palpate.images.readers.registry import StoredImage
 EXCLUSIVE = "CLOSEDPLANAR_XOR"
 CLOSED = ("CLOSED_PLANAR", EXCLUSIVE)
 MOST_TRIED = 20  # contours of a structure, to see how slices lie
-MOST_SHOWN = 8  # structures, or slices of one, in a sentence
+MOST_SHOWN = 3  # slices of a structure, in a sentence
 ONE_PLANE = 0.1  # of the distance of slices, between points of one contour, and contours of one plane
 TOLD: Mapping[Code, str] = {
-    "open-contours": "contours were left out, or are cut with the series",
-    "sparse-contours": "slices are not as contours were drawn",
+    "open-contours": "contours were left out, or are cut off where the series ends: ",
+    "sparse-contours": "slices have no contour of their own, or contours that cross: ",
 }
 
 
@@ -53,7 +53,7 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
     series = series_beside(path, [*frames] or slices, grid)
     if series is None:
         advice = "copy it there, or name a grey image on its grid as intensities_before or intensities_after"
-        raise InputDataError(f"the DICOM series that '{path}' was drawn on is not beside it; {advice}")
+        raise InputDataError(f"the DICOM series on which '{path}' was drawn is not in the same folder; {advice}")
     # the slices lie across the axis along which the contours run least
     extent = sum((np.ptp(series.grid.index(_points(contour)), axis=0) for contour in tried), np.zeros(3))
     order = sorted(range(3), key=lambda axis: axis != int(np.argmin(extent)))
@@ -72,7 +72,11 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
     labels, overlaps = merged(masks(), tuple(series.grid.shape[k] for k in order))
     if not rows:
         raise InputDataError(f"'{path}' has no structure with a contour that encloses something; export it again")
-    findings = [Finding(code, f"{TOLD[code]}: {_some(parts)}; look at them") for code, parts in notes.items() if parts]
+    findings = [
+        Finding(code, listing(TOLD[code], parts, ". Look at them, and draw again what is wrong."))
+        for code, parts in notes.items()
+        if parts
+    ]
     labels, digests = np.moveaxis(labels, 0, order[0]), {"": sha256, **series.digests}
     return StoredImage(labels, series.grid.affine, tuple(rows), digests, (*findings, *overlaps))
 
@@ -80,10 +84,6 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
 def _points(contour: Dataset) -> NDArray[np.float64]:
     """The points of a contour (n, 3), RAS mm."""
     return np.asarray(np.array(contour.ContourData, dtype=np.float64).reshape(-1, 3) * LPS_TO_RAS)
-
-
-def _some(parts: Sequence[str]) -> str:
-    return ", ".join(parts[:MOST_SHOWN]) + ", ..." * (len(parts) > MOST_SHOWN)
 
 
 def _rows(dataset: Dataset, drawn: Mapping[int, list[Dataset]]) -> Iterator[tuple[NamedLabel, str, list[Dataset]]]:
@@ -103,15 +103,15 @@ def _rows(dataset: Dataset, drawn: Mapping[int, list[Dataset]]) -> Iterator[tupl
 def _filled(
     row: NamedLabel, contours: list[Dataset], grid: VoxelGrid, order: Sequence[int], path: Path
 ) -> tuple[NDArray[np.bool_] | None, str, str]:
-    """A structure's voxels in the order of axes, what was left out or is cut, and what was filled or joined."""
+    """A structure's voxels in the order of axes; in words what was left out or cut, and what was filled or joined."""
     several = [(of.get("ContourGeometricType"), grid.index(_points(of))[:, order]) for of in contours]
     closed = [points for kind, points in several if len(points) >= 3 and kind in CLOSED]
     planes = _planes(closed, f"a contour of '{row.name}' in '{path}'")
     heights, n_short = np.array([*planes]), sum(len(points) < 3 for _, points in several)
     counts = {
         "open": len(several) - n_short - len(closed),
-        "of under 3 points": n_short,
-        "in the file twice": len(closed) - sum(map(len, planes.values())),
+        "with under 3 points": n_short,
+        "twice in the file": len(closed) - sum(map(len, planes.values())),
     }
     flaws = [f"{n} {kind}" for kind, n in counts.items() if n] if several else ["none on this series"]
     if not closed:
@@ -126,11 +126,11 @@ def _filled(
     words = []
     for kind, slices in noted.items():
         index = np.array([[k, *middle[1:]] for k in slices]).reshape(-1, 3)[:, np.argsort(order)]
-        places = _some([f"{mm:.4g}" for mm in grid.world(index)[:, order[0]]])
-        words += [f"{len(slices)} at {'RAS'[order[0]]} {places} mm {kind}"] if slices else []
+        places = some([f"{mm:.4g}" for mm in grid.world(index)[:, order[0]]], most=MOST_SHOWN)
+        words += [f"{len(slices)} {kind}, at {'RAS'[order[0]]} = {places} mm"] if slices else []
     apart = np.sort(np.diff(heights)) * grid.spacing[order[0]]
     every = " to ".join(dict.fromkeys(f"{mm:.3g}" for mm in (*apart[:1], *apart[-1:])))
-    words += [f"its planes every {every} mm"] if words else []
+    words += [f"contours every {every} mm"] if words else []
     return inside, " and ".join(flaws), "; ".join(words)
 
 
@@ -140,8 +140,8 @@ def _planes(closed: Sequence[Contour], called: str) -> dict[float, list[Contour]
     for points in sorted(closed, key=lambda points: float(points[:, 0].mean())):
         height, spread = float(points[:, 0].mean()), float(np.ptp(points[:, 0]))
         if not spread <= ONE_PLANE:
-            flaw = f"runs over {spread:.3g} slices of its series, not one"
-            raise InputDataError(f"{called} {flaw}; draw the structures on its slices")
+            flaw = f"runs across {spread:.3g} slices of its series, not within one"
+            raise InputDataError(f"{called} {flaw}; draw the structures on the slices of the series")
         if not planes or height - max(planes) > ONE_PLANE:
             planes[height] = []
         planes[max(planes)].append(points[:, 1:])

@@ -71,7 +71,7 @@ def series_beside(path: Path, uids: Sequence[str], grid: VoxelGrid | None) -> Se
     step = steps.mean(axis=0) if len(steps) else np.zeros(3)
     alike = all(head.get(name) == first.get(name) for head, _ in found for name in STACKED)
     if not alike or not len(steps) or float(np.abs(steps - step).max()) > UNEVEN * float(np.linalg.norm(step)):
-        flaw = f"the {len(found)} slices beside '{path}' of its series are no stack of one size and even distance"
+        flaw = f"the {len(found)} slices of the series beside '{path}' differ in size, or are not evenly spaced"
         raise InputDataError(f"{flaw}; put one complete series there")
     between_rows, between_columns = (float(number) for number in first.PixelSpacing)
     lps = np.eye(4)

@@ -23,8 +23,8 @@ from palpate.images.readers.voxel_stream import check_size
 
 MOST_SEGMENTS = 1000
 CROPPED = (
-    "the image ends with the first and the last slice that a segment reaches, as files of this kind leave out empty"
-    " slices; copy the DICOM series that it was made on beside it, or name a grey image on its grid as intensities"
+    "the image ends at the first and the last slice that has a segment, because DICOM-SEG leaves out empty slices. Copy"
+    " the DICOM series beside the file, or name a grey image on its grid as intensities."
 )
 
 
@@ -37,14 +37,14 @@ def read(path: Path, grid: VoxelGrid | None) -> StoredImage:
     dataset, sha256 = read_dataset(path)
     if dataset.SegmentationType == "FRACTIONAL":
         advice = "threshold it, and save it as a binary or labelmap segmentation"
-        raise InputDataError(f"'{path}' is a fractional segmentation, which has no border; {advice}")
+        raise InputDataError(f"'{path}' is a fractional segmentation, which has no sharp surface; {advice}")
     segmentation = Segmentation.from_dataset(dataset, copy=False)
     numbers = [int(number) for number in segmentation.segment_numbers]
     if not 1 <= len(numbers) <= MOST_SEGMENTS:
         raise InputDataError(f"'{path}' has {len(numbers)} segments; 1 to {MOST_SEGMENTS} are read")
     geometry = segmentation.get_volume_geometry()
     if geometry is None:
-        raise InputDataError(f"the slices of '{path}' are not evenly spaced, so that they are no image; resample it")
+        raise InputDataError(f"the slices of '{path}' are not evenly spaced; resample it on an even grid")
     shape = tuple(geometry.spatial_shape)
     check_size(shape, path)
     rows = [_row(item) for item in segmentation.SegmentSequence if int(item.SegmentNumber) in numbers]

@@ -75,17 +75,17 @@ def read_stored(
 
 
 def _sudden_end(code: int, path: Path, limits: ReadLimits) -> PalpateError:
-    """Why a process ended without an image, by its exit code."""
+    """The error for a process that ended without an image, by its exit code."""
     name = name_of_end(code)
     if code == NEVER_BEGAN:
-        advice = f"is Palpate installed in {sys.prefix} and is memory left?"
+        advice = f"check that Palpate is installed in {sys.prefix} and that memory is free"
         return ResourceError(f"the process that reads '{path}' did not start; {advice}")
     if name in ("SIGXCPU", "SIGALRM"):
         took = f"more than {limits.cpu_seconds} s of processor time, or {limits.wall_seconds:g} s in all"
         return ResourceError(f"reading '{path}' took {took}; copy it to a local disk, or export it again")
     if name == "SIGKILL":
-        return ResourceError(f"the system stopped the reading of '{path}', as memory is short; crop the image")
-    return InputDataError(f"the reader of '{path}' crashed ({name}); it is most likely damaged: export it again")
+        return ResourceError(f"the system stopped the reading of '{path}' because memory ran out; crop the image")
+    return InputDataError(f"the reader of '{path}' crashed ({name}); the file is probably damaged: export it again")
 
 
 def _stored(pipe: BinaryIO, path: Path) -> StoredImage | None:
@@ -110,7 +110,9 @@ def _stored(pipe: BinaryIO, path: Path) -> StoredImage | None:
     except (AttributeError, KeyError, TypeError, ValueError):
         valid = None
     if not valid:
-        raise InputDataError(f"the process that read '{path}' gave an answer of no use; export the image again")
+        raise InputDataError(
+            f"the process that read '{path}' gave an answer that cannot be used; export the image again"
+        )
     dtype = np.dtype(answer["dtype"])
     content = pipe.read(math.prod(shape) * dtype.itemsize)
     if len(content) < math.prod(shape) * dtype.itemsize:

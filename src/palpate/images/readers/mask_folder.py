@@ -78,13 +78,13 @@ def _mask_files(folder: Path) -> dict[str, str]:
     for name in sorted(name for name in names if not name.startswith(".")):
         stem = next((name[: -len(ending)] for ending in ENDINGS if name.lower().endswith(ending)), "")
         if stem and found.setdefault(stem, name) != name:
-            raise InputDataError(f"'{folder}' has two masks of '{printable(stem)}'; take one away")
+            raise InputDataError(f"'{folder}' has two masks of '{printable(stem)}'; remove one")
     if not found and any(marked_format(folder / name) for name in sorted(names)[:MOST_LOOKED_AT]):
         raise refused_series(folder)
     if not 1 <= len(found) <= MOST_MASKS or len(names) > MOST_FILES:
         among = str(len(names)) if len(names) <= MOST_FILES else f"over {MOST_FILES}"
-        flaw = f"has {len(found)} masks ({', '.join(ENDINGS)}) among {among} files"
-        raise InputDataError(f"the folder '{folder}' {flaw}; 1 to {MOST_MASKS} are read, or name a label image")
+        flaw = f"holds {len(found)} masks ({', '.join(ENDINGS)}) in {among} files"
+        raise InputDataError(f"the folder '{folder}' {flaw}; it needs 1 to {MOST_MASKS}, or name a label image instead")
     return found
 
 
@@ -100,11 +100,11 @@ def _rows(stems: Collection[str]) -> list[NamedLabel]:
 def _read(path: Path) -> StoredImage:
     file = followed(path, path.parent)
     if file is None:
-        raise InputDataError(f"'{path}' is a link that leads out of its folder, which is not followed; copy the mask")
+        raise InputDataError(f"'{path}' is a link to a file outside its folder, which is not followed; copy the mask")
     image = format_of(file).read(file)
     if image.names:
-        flaw = f"brings names of {len(image.names)} segments of its own, so it is no mask of one organ"
-        raise InputDataError(f"'{path}' {flaw}; name that file as the image, or take it out of the folder")
+        flaw = f"has {len(image.names)} named segments, so it is not a mask of one organ"
+        raise InputDataError(f"'{path}' {flaw}; name that file as the image, or remove it from the folder")
     return image
 
 

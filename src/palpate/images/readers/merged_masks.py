@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.findings import Finding
+from palpate.findings import Finding, listing
 from palpate.images.named_labels import NamedLabel, printable
 
 BODY = frozenset(("body", "external", "outline", "skin"))  # words of a name: all organs lie in that mask
-MOST_SHOWN = 3  # pairs of organs in the sentence
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +51,7 @@ def merged(masks: Iterable[Mask], shape: tuple[int, ...]) -> tuple[NDArray[np.ui
     if not overlaps:
         return labels, ()
     ranked = sorted(overlaps, key=lambda pair: (-overlaps[pair], pair))
-    pairs = [f"'{printable(names[a])}' in '{printable(names[b])}' ({overlaps[a, b]})" for a, b in ranked[:MOST_SHOWN]]
-    text = (
-        f"{np.count_nonzero(contested)} voxels are claimed by several organs, and each went to the smallest of them:"
-        f" {', '.join(pairs)}{', ...' if len(ranked) > MOST_SHOWN else ''}; correct what is wrong"
-    )
+    pairs = [f"'{printable(names[a])}' in '{printable(names[b])}' ({overlaps[a, b]})" for a, b in ranked]
+    lead = f"{np.count_nonzero(contested)} voxels belong to several masks, and each went to the smallest organ: "
+    text = listing(lead, pairs, ". Correct masks that may not overlap.")
     return labels, (Finding("overlap", text),)

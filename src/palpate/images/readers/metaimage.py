@@ -53,7 +53,7 @@ def metaimage_content(path: Path) -> StoredArray:
         skip = int(_numbers(fields, "HeaderSize", path, 1, [0.0])[0])
         skip -= file.tell() if beside is None and skip > 0 else 0  # it counts from the start of the file
         if skip < -1 or (skip and packed):
-            raise refused(path, "HeaderSize", fields["HeaderSize"], "no voxels begin there: export the image again")
+            raise refused(path, "HeaderSize", fields["HeaderSize"], "voxels cannot begin there; export the image again")
         packing = "zlib" if packed else "raw" if binary else "ascii"
         block = VoxelBlock((channels, *sizes), np.dtype(order + TYPES[kind]), packing, skip)
         values, digests = voxels_of(file, path, beside, block)
@@ -70,7 +70,7 @@ def _fields(lines: list[str], path: Path) -> dict[str, str]:
             continue
         first, second = fields.setdefault(name, value[0]).split(), value[0].split()
         if first != second and not (numbers_in(first) and numbers_in(first) == numbers_in(second)):
-            raise refused(path, name, fields[name], "it has it twice, with another value then; leave the right one")
+            raise refused(path, name, fields[name], "it is there twice, with different values; delete the wrong one")
     if LAST not in fields:
         raise InputDataError(f"'{path}' does not begin as a MetaImage file does; export it as MetaImage or NIfTI")
     return fields
@@ -79,16 +79,20 @@ def _fields(lines: list[str], path: Path) -> dict[str, str]:
 def _affine(fields: Mapping[str, str], n: int, path: Path) -> NDArray[np.float64]:
     """Index -> RAS mm; ITK takes the world of every MetaImage for LPS, whatever AnatomicalOrientation says."""
     if fields.get("NDims") != str(n) or n < 3:
-        raise refused(path, "NDims", fields.get("NDims"), f"three axes are needed, DimSize has {n}: export it again")
+        raise refused(
+            path, "NDims", fields.get("NDims"), f"three axes are needed, but DimSize has {n} sizes; export it again"
+        )
     rows = np.reshape(_numbers(fields, "TransformMatrix", path, n * n), (n, n))
     name = "ElementSpacing" if "ElementSpacing" in fields else "ElementSize"
     spacing = np.array(_numbers(fields, name, path, n))
     if not (spacing > 0.0).all():
-        raise refused(path, name, fields[name], "it must be positive; turn the axis in TransformMatrix")
+        raise refused(path, name, fields[name], "it must be positive; reverse the axis in TransformMatrix instead")
     if rows[:3, 3:].any() or rows[3:, :3].any():
-        raise refused(path, "TransformMatrix", fields["TransformMatrix"], "time leans into space: extract one volume")
+        raise refused(path, "TransformMatrix", fields["TransformMatrix"], "it mixes space and time; extract one volume")
     if fields.get("DistanceUnits", "mm") not in ("mm", "?"):
-        raise refused(path, "DistanceUnits", fields["DistanceUnits"], "most programs pass over it: state lengths in mm")
+        raise refused(
+            path, "DistanceUnits", fields["DistanceUnits"], "most programs ignore that unit; write lengths in mm"
+        )
     affine, origin = np.eye(4), _numbers(fields, "Offset", path, n, [0.0] * n)
     with np.errstate(over="ignore"):  # what is not finite is refused later, with its numbers
         affine[:3, :3] = LPS_TO_RAS[:, None] * rows[:3, :3].T * spacing[:3]
@@ -100,7 +104,7 @@ def _counts(fields: Mapping[str, str], name: str, path: Path, default: str = "mi
     words = fields.get(name, default).split()
     sizes = [int(word) for word in words if word.isascii() and word.isdigit() and len(word) <= 20]
     if len(sizes) != len(words) or not sizes or min(sizes) < 1:
-        raise refused(path, name, " ".join(words), "it must be positive counts: export the image again")
+        raise refused(path, name, " ".join(words), "positive counts are needed; export the image again")
     return sizes
 
 
@@ -110,7 +114,7 @@ def _numbers(
     """The `n` numbers of a field."""
     found = numbers_in(fields[name].split()) if name in fields else default
     if found is None or len(found) != n:
-        advice = f"{n} numbers are needed; without them an image has no place: export it again, with them"
+        advice = f"{n} numbers are needed to place the image; export it again with them"
         raise refused(path, name, fields.get(name, "missing"), advice)
     return found
 
@@ -118,7 +122,7 @@ def _numbers(
 def _flag(fields: Mapping[str, str], name: str, path: Path, default: str = "False") -> bool:
     value = fields.get(name, default).lower()
     if value not in ("true", "false", "1", "0"):
-        raise refused(path, name, value, "it is not True or False: correct it")
+        raise refused(path, name, value, "it must be True or False; correct it")
     return value in ("true", "1")
 
 

@@ -79,7 +79,7 @@ def nifti_content(path: Path, check: Callable[[Any, tuple[int, ...], Path], None
         zipped = file.peek(2)[:2] == b"\x1f\x8b"
         if zipped != path.name.lower().endswith(".gz"):
             flaw, ending = ("is compressed", ".nii.gz") if zipped else ("is not compressed by gzip", ".nii")
-            raise InputDataError(f"'{path}' {flaw}, against its ending; rename it to {ending}")
+            raise InputDataError(f"'{path}' {flaw}, unlike its ending says; rename it to {ending}")
         unpacked, ratio = STREAMS["gzip" if zipped else "raw"]
         stream = unpacked(file)
         content = read_exactly(stream, 348, path).tobytes()

@@ -77,7 +77,7 @@ def _fields(lines: list[str], path: Path) -> dict[str, Any]:
         if not value.startswith("="):  # else it is a key
             name = SYNONYMS.get(name.strip().lower(), name.strip().lower())
         if name in NUMBERS and not PLAIN.fullmatch(value):  # Python reads 1_5 and digits of all scripts
-            raise refused(path, name, value.strip(), "its numbers must be plain digits: correct it")
+            raise refused(path, name, value.strip(), "it must be written in plain digits; correct it")
         if name in VECTORS:  # vectors without blanks; a bare nan, for an axis outside space, is no vector
             vectors = re.findall(r"\([^()]*\)|[^\s()]+", value.lower())
             value = " ".join("none" if each == "nan" else re.sub(r"\s+", "", each) for each in vectors)
@@ -91,7 +91,7 @@ def _fields(lines: list[str], path: Path) -> dict[str, Any]:
         if name not in fields:
             raise refused(path, name, "missing", "export the image again")
     if min(fields["sizes"], default=0) < 1 or len(fields["sizes"]) != fields["dimension"]:
-        raise refused(path, "sizes", fields["sizes"], f"{fields['dimension']} positive counts are needed: export again")
+        raise refused(path, "sizes", fields["sizes"], f"{fields['dimension']} positive counts are needed; export again")
     return fields
 
 
@@ -124,10 +124,12 @@ def _place(fields: Mapping[str, Any], path: Path) -> tuple[NDArray[np.float64], 
     timed = space.endswith("-time") or len(space) == 4
     signs, n = RAS_SIGNS.get(space.removesuffix("-time")[: 3 if len(space) == 4 else None]), 3 + timed
     if signs is None or "space directions" not in fields:
-        raise refused(path, "space", space, "it does not say where right, front and head are; export it as LPS or RAS")
+        raise refused(path, "space", space, "left, right, front and head are unknown; export it as LPS or RAS")
     vectors, origin = fields["space directions"], fields.get("space origin", np.zeros(n))
     if vectors.shape != (fields["dimension"], n) or origin.shape != (n,):
-        raise refused(path, "space directions", vectors.tolist(), f"vectors of {n} numbers, one a size, are needed")
+        raise refused(
+            path, "space directions", vectors.tolist(), f"vectors of {n} numbers are needed, one for each axis"
+        )
     beside = np.isnan(vectors).all(axis=1) | (timed & ~vectors[:, :3].any(axis=1))
     if np.count_nonzero(~beside) != 3 or vectors[~beside, 3:].any():
         raise refused(path, "space directions", vectors.tolist(), "three axes are needed; extract one volume")

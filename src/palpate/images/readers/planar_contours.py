@@ -21,7 +21,7 @@ ON_SLICE = 0.05  # slices between a plane and the slice that it was drawn on
 SAME = 0.2  # of a voxel, between the points of a contour and those of its copy, which may be rounded
 WITHIN = 0.95  # share of a contour's pixels in another one, above which it is a hole
 FILLED = 3.05  # of the planes' distance: larger gaps between planes are not filled
-INTERPOLATED, EMPTY, JOINED = "interpolated", "left empty, far from the next plane", "joined, for contours cross there"
+INTERPOLATED, EMPTY, JOINED = "interpolated", "left empty, too far from the next", "joined where contours cross"
 STEP, MOST_STEPS = 0.25, 4000  # pixels between points along an edge, from which distances are measured
 
 

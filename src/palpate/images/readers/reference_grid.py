@@ -25,9 +25,9 @@ FARTHEST = 1e9  # mm, voxels
 OFFSET, GEOMETRY, EXTENT = (
     f"Segmentation_{key}" for key in ("ReferenceImageExtentOffset", "ConversionParameters", "Extent")
 )
-CROPPED = "the image ends with the segments, for 3D Slicer cropped it to them"
-PERHAPS = "segments reach all six sides of the image, as where 3D Slicer cropped it to them"
-ADVICE = "save it there without 'crop to minimum extent', or name a grey image on its grid as intensities"
+CROPPED = "the image ends where the segments end, because 3D Slicer cropped it"
+PERHAPS = "segments reach all six sides of the image, as if 3D Slicer cropped it"
+ADVICE = 'Save it there without "crop to minimum extent", or name a grey image on its grid as intensities.'
 
 
 def on_grid(image: StoredImage, grid: VoxelGrid | None) -> StoredImage | None:
@@ -66,7 +66,7 @@ def uncropped(image: StoredImage, keys: Mapping[str, str], grid: VoxelGrid | Non
     check_size(tuple(n + more for n, more in zip(image.values.shape, first, strict=True)), path)
     affine = image.affine.copy()
     affine[:3, 3] -= affine[:3, :3] @ first
-    finding = Finding("cropped", f"{CROPPED if any(first) else PERHAPS}; {ADVICE}")
+    finding = Finding("cropped", f"{CROPPED if any(first) else PERHAPS}. {ADVICE}")
     values = np.pad(image.values, [(n, 0) for n in first])
     return replace(image, values=values, affine=affine, findings=(*image.findings, finding))
 

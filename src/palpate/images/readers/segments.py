@@ -52,7 +52,7 @@ def unit_colour(words: Sequence[str]) -> str | None:
 def _whole(text: str, *, low: int) -> int:
     text = text.strip()
     if not (text.isascii() and text.isdigit() and len(text) <= 6 and low <= int(text) <= MAX_LABEL):
-        flaw = f"label value or layer '{printable(text[:30])}', no whole number from {low} to {MAX_LABEL}"
+        flaw = f"label value or layer '{printable(text[:30])}', not a whole number from {low} to {MAX_LABEL}"
         raise ValueError(f"has a segment with the {flaw}")
     return int(text)
 
@@ -74,7 +74,7 @@ def flattened(
     merged = np.zeros(layers.shape[1:], dtype=np.uint16)
     for k, layer in enumerate(layers):
         if layer.dtype.kind not in "iu" or layer.min() < 0 or layer.max() > MAX_LABEL:
-            raise ValueError(f"has layers with values that are no labels from 0 to {MAX_LABEL}")
+            raise ValueError(f"has layers with values that are not labels from 0 to {MAX_LABEL}")
         table = np.zeros(MAX_LABEL + 1, dtype=np.uint16)
         for (place, row), named in zip(segments, names, strict=True):
             if place == k:
@@ -88,7 +88,7 @@ def flattened(
             first, second = (of[int(labels[both][0])] for labels in (merged, mapped))
             many = np.count_nonzero(both)
             raise ValueError(
-                f"has segments that overlap in {many} voxels, as '{first}' and '{second}'; erase one there"
+                f"has segments that overlap in {many} voxels, such as '{first}' and '{second}'; erase one there"
             )
         merged += mapped
     return merged, names

@@ -55,7 +55,10 @@ def read_stl(path: Path) -> SurfaceFile:
     if len(content) == whole or (count and len(content) > whole):
         corners = np.asarray(np.frombuffer(content, FACET, count, HEADING + 4)["corners"], dtype=np.float64)
     elif content.lstrip()[:5].lower() != b"solid":
-        raise InputDataError(f"'{path}' is no STL: neither whole triangles, nor a text that begins with 'solid'")
+        raise InputDataError(
+            f"'{path}' is not an STL file: it is neither binary with whole triangles nor a text that begins with"
+            " 'solid'"
+        )
     elif len(content) > MOST_TEXT:
         raise InputDataError(f"'{path}' is a text of over {MOST_TEXT // 2**20} MB; export it as a binary STL")
     else:
@@ -65,7 +68,9 @@ def read_stl(path: Path) -> SurfaceFile:
         except ValueError as error:
             raise InputDataError(f"'{path}' is a damaged text ({error}); export it again") from error
     if not np.isfinite(corners).all() or np.abs(corners).max(initial=0.0) > MOST_MM:
-        raise InputDataError(f"'{path}' has coordinates that are no number of millimetres; export it again")
+        raise InputDataError(
+            f"'{path}' has coordinates that are not finite, or too large for millimetres; export it again"
+        )
     points, numbers = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     triangles = numbers.reshape(-1, 3)
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]  # of two corners in one place
@@ -74,8 +79,8 @@ def read_stl(path: Path) -> SurfaceFile:
     turns = np.bincount(edge.reshape(-1), weights=np.sign(edges[:, 1] - edges[:, 0]), minlength=len(shared))
     open_, opposed = np.count_nonzero(shared % 2), np.count_nonzero(turns[shared % 2 == 0])
     if not len(triangles) or open_:
-        flaw = f"{len(triangles)} triangles, {open_} edges of an odd number of them"
-        raise InputDataError(f"'{path}' is not closed ({flaw}); fill its holes where it was made")
+        flaw = f"{open_} edges of its {len(triangles)} triangles lack a neighbour"
+        raise InputDataError(f"'{path}' is not closed ({flaw}); fill its holes in the program that made it")
     if opposed:
         advice = "recalculate its normals (Blender: Recalculate Outside; MeshLab: Re-Orient all faces coherently)"
         flaw = f"the triangles beside {opposed} of {len(shared)} edges of '{path}' face opposite ways"

@@ -39,7 +39,7 @@ def header_lines(file: InputFile, path: Path, last: str) -> list[str]:
 
 
 def refused(path: Path, field: str, value: object, advice: str) -> InputDataError:
-    """The sentence for a field of a header that cannot be used."""
+    """The error for a field of a header that cannot be used."""
     return InputDataError(f"the header of '{path}' has '{field}: {printable(str(value)[:60])}'; {advice}")
 
 

@@ -25,16 +25,16 @@ def reduced(image: StoredImage, path: Path, *, kind: str) -> StoredImage:
         with np.errstate(over="ignore"):
             return replace(image, values=image.values.astype(np.float32, copy=False))
     slope, intercept = image.scale
-    scaled = f"scaled: its header makes them of what is stored by scl_slope {slope:g} and scl_inter {intercept:g}"
+    scaled = f"the header scales the stored numbers by scl_slope = {slope:g} and scl_inter = {intercept:g}"
     try:
         image = replace(image, values=label_values(image.values, path))
     except InputDataError as error:
         if image.scale == (1.0, 0.0):
             raise
-        raise InputDataError(f"{error}. These are {scaled}; labels are stored with 1 and 0") from error
+        raise InputDataError(f"{error}. Also, {scaled}; labels need 1 and 0") from error
     if image.scale == (1.0, 0.0) or 0.0 < slope < 1.0:  # which programs write that scale whatever they save
         return image
-    text = f"the labels are {scaled}; set these to 1 and 0 if the stored numbers are the labels"
+    text = f"{scaled} to make labels. Set these to 1 and 0 if the stored numbers are the labels."
     return replace(image, findings=(*image.findings, Finding("scaled-labels", text)))
 
 
@@ -45,20 +45,20 @@ def label_values(values: NDArray[Any], path: Path) -> NDArray[Any]:
     """
     if values.dtype.kind == "f":
         if lost := values.size - np.count_nonzero(np.isfinite(values)):
-            flaw = f"{lost} of {values.size} voxels that are NaN or infinite"
-            raise InputDataError(f"'{path}' has {flaw}; give those voxels a label (0 for background)")
+            flaw = f"{lost} of {values.size} voxels are NaN or infinite"
+            raise InputDataError(f"'{path}' is no label image: {flaw}; give those voxels a label (0 for background)")
         whole = np.rint(values)
         away = np.abs(values - whole)
         worst = np.unravel_index(int(np.argmax(away)), values.shape)
         if away[worst] > INTEGRAL_TOLERANCE:
             flaw = f"{np.count_nonzero(away > INTEGRAL_TOLERANCE)} of {values.size} voxels are not integers"
             advice = "threshold a probability map, or resample labels with nearest neighbour"
-            raise InputDataError(f"'{path}' is no label image: {flaw}, as {values[worst]:.6g}; {advice}")
+            raise InputDataError(f"'{path}' is no label image: {flaw}, such as {values[worst]:.6g}; {advice}")
         values = whole
     low, high = values.min(), values.max()
     if low < 0 or high > MAX_LABEL:
-        flaw = f"run from {low:.9g} to {high:.9g}, not within 0 to {MAX_LABEL}"
-        raise InputDataError(f"the labels of '{path}' {flaw}; is it a grey image? Name the segmentation")
+        flaw = f"run from {low:.9g} to {high:.9g}, outside 0 to {MAX_LABEL}"
+        raise InputDataError(f"the labels of '{path}' {flaw}; it may be a grey image: name the segmentation instead")
     return values.astype(np.uint8 if high <= 255 else np.uint16, copy=False)
 
 
@@ -66,7 +66,9 @@ def check_affine(affine: NDArray[np.float64], path: Path) -> None:
     """Refuse an affine (4, 4) that is not finite, flat or sheared: raises `InputDataError`."""
     advice = "repair its header (sform or qform), or export the image again"
     if not np.isfinite(affine).all():
-        raise InputDataError(f"the header of '{path}' places the voxels at {affine[:3].tolist()}, not finite; {advice}")
+        raise InputDataError(
+            f"the header of '{path}' has an affine that is not finite, {affine[:3].tolist()}; {advice}"
+        )
     with np.errstate(all="ignore"):
         spacing = np.linalg.norm(affine[:3, :3], axis=0)
         volume, box = abs(np.linalg.det(affine[:3, :3])), np.prod(spacing)
@@ -75,7 +77,7 @@ def check_affine(affine: NDArray[np.float64], path: Path) -> None:
         raise InputDataError(f"the affine in the header of '{path}' flattens the image ({edges}); {advice}")
     directions = affine[:3, :3] / spacing
     if (cosine := np.abs(directions.T @ directions - np.eye(3)).max()) > MAX_SHEAR:
-        flaw = f"are not at right angles (cosine {cosine:.3g}, a tilted gantry?)"
+        flaw = f"are not at right angles (cosine {cosine:.3g}), as after a tilted gantry"
         raise InputDataError(f"the voxel axes of '{path}' {flaw}; resample it on a rectangular grid")
 
 

@@ -115,7 +115,7 @@ def read_voxels(stream: io.BufferedIOBase, block: VoxelBlock, path: Path) -> NDA
     while left >= 0 and (rest := stream.read(left + 1)):  # to its end, where the sum is checked
         left -= len(rest)
     if left < 0:
-        flaw = f"goes on for more than {SLACK} bytes after the {block.n_bytes} bytes of voxels of its header"
+        flaw = f"has more than {SLACK} bytes after the {block.n_bytes} bytes of voxels that its header states"
         raise InputDataError(f"'{path}' {flaw}; it is damaged, or not what it claims to be: export it again")
     return values.astype(block.dtype.newbyteorder("="), copy=False).reshape(block.shape, order="F")
 
@@ -131,7 +131,7 @@ def _written(file: InputFile, block: VoxelBlock, path: Path) -> NDArray[Any]:
     with np.errstate(all="ignore"):
         exact = values.astype(block.dtype.newbyteorder("="))
     if len(values) != n or not (block.dtype.kind == "f" or (exact == values).all()):
-        flaw = f"are written as text, but {n} numbers of the type {block.dtype.name} are not there"
+        flaw = f"are written as text, but are not {n} numbers of the type {block.dtype.name}"
         raise InputDataError(f"the voxels of '{path}' {flaw}; export the image again")
     return exact.reshape(block.shape, order="F")
 
@@ -140,10 +140,10 @@ def check_size(shape: tuple[int, ...], path: Path, *, needed: int = 0, available
     """Refuse more voxels than are read, and what the file cannot hold: `needed` bytes in `available` unpacked ones."""
     sizes = " x ".join(map(str, shape))[:100]
     if math.prod(shape) > MAX_VOXELS:
-        flaw = f"promises {sizes} voxels, more than the {MAX_VOXELS} that are read"
-        raise InputDataError(f"the header of '{path}' {flaw}; crop the image to the organs, or the header is damaged")
+        flaw = f"states {sizes} voxels, more than the {MAX_VOXELS} that are read"
+        raise InputDataError(f"the header of '{path}' {flaw}; crop the image to the organs, or repair the header")
     if needed > available:
-        flaw = f"promises {needed} bytes ({sizes} voxels), which the file cannot hold"
+        flaw = f"states {needed} bytes ({sizes} voxels), which the file cannot hold"
         raise InputDataError(f"the header of '{path}' {flaw}; it is cut short or damaged: export or copy it again")
 
 

@@ -91,7 +91,7 @@ def factorise(
     if solver != "auto" and solver not in SOLVERS:
         raise ConfigurationError(f"solver is '{solver}'; it must be 'auto' or one of {sorted(SOLVERS)}")
     if matrix.shape[0] == 0:
-        raise SolverError("no displacement is free: every point of the mesh is prescribed, nothing is left to solve")
+        raise SolverError("no displacement is free: every point of the mesh is prescribed; leave some points free")
     if not np.all(np.isfinite(matrix.data)):
         raise SolverError("the stiffness is not finite: check the moduli and the mesh's volumes")
     hints = Hints(near_nullspace, coarser, right_hand_sides)

@@ -38,7 +38,7 @@ class _Sets(dict[str, Numbers]):
         """The members that rows list, by number or by set."""
         words = [word.upper() for row in rows for word in row]
         if unknown := [word for word in words if word not in self and not word.isdecimal()]:
-            raise InputDataError(f"it names a set '{unknown[0][:80]}' that it has not")
+            raise InputDataError(f"it names a set '{unknown[0][:80]}' that it does not define")
         return np.concatenate([NONE, *(self[word] if word in self else np.array([int(word)]) for word in words)])
 
 
@@ -50,7 +50,7 @@ def read_abaqus(content: bytes, _: str | None) -> Elements:
         n_parts += keyword == "PART"
         moved = (keyword == "INSTANCE" and rows) or (keyword == "NODE" and "SYSTEM" in options)
         if keyword in MADE or n_parts > 1 or moved:
-            raise InputDataError(f"it places nodes or elements by *{keyword}, which is not read: {FLAT}")
+            raise InputDataError(f"it places nodes or elements by *{keyword}, which is not supported: {FLAT}")
         if keyword == "NODE":
             nodes += (own := [int(row[0]) for row in rows])
             points += [[*row[1:], "0", "0", "0"][:3] for row in rows]
@@ -69,7 +69,7 @@ def read_abaqus(content: bytes, _: str | None) -> Elements:
                 surfaces += [(name, faces) for faces in _faces(rows, known["ELSET"], tables)]
     numbers, at = np.concatenate([NONE, *(table[:, 0] for _, table in tables)]), {n: at for at, n in enumerate(nodes)}
     if len(at) < len(nodes) or len(np.unique(numbers)) < len(numbers):
-        raise InputDataError(f"two nodes or two elements have one number; {FLAT}")
+        raise InputDataError(f"two nodes or two elements have the same number; {FLAT}")
     placed = np.vectorize(lambda number: at.get(number, -1), otypes=[np.int64])
     cells = [(kind, table[:, 0], placed(table[:, 1:])) for kind, table in tables]
     blocks: list[Block] = [(kind, rows, ()) for kind, _, rows in cells]
@@ -84,7 +84,7 @@ def _generated(rows: Rows) -> Numbers:
     """The members that rows give as first, last and step."""
     steps = [range(first, last + 1, step) for first, last, step in ([*map(int, row), 1][:3] for row in rows)]
     if sum(map(len, steps)) > MOST_MEMBERS:
-        raise InputDataError(f"a set of over {MOST_MEMBERS:.0e} members is generated; write its last number right")
+        raise InputDataError(f"a set of over {MOST_MEMBERS:.0e} members is generated; correct its last number")
     return np.concatenate([NONE, *map(np.array, steps)]).astype(np.int64)
 
 
@@ -116,8 +116,8 @@ def _table(name: str, rows: Rows) -> tuple[str, Numbers]:
     elif HOLLOW.match(name):
         kind, n, rows = "line", 0, []
     else:
-        raise InputDataError(f"its elements of the type '{name[:80]}' are not known; leave them out")
+        raise InputDataError(f"its elements of the type '{name[:80]}' are not supported; remove them")
     words = [int(word) for row in rows for word in row]
     if len(words) % (1 + n):
-        raise InputDataError(f"its elements of the type '{name[:80]}' have not {n} nodes each; export it again")
+        raise InputDataError(f"its elements of the type '{name[:80]}' do not have {n} nodes each; export it again")
     return kind, np.array(words, dtype=np.int64).reshape(-1, 1 + n)

@@ -65,7 +65,7 @@ def read_gmsh(content: bytes, data: str | None) -> Elements:
     """The same of gmsh's: all groups of an element, of which meshio gives the first, and none where any has none."""
     head = re.search(rb"\$MeshFormat\s+(2|4\.1)\S*\s+([01])", content)
     if head is None or b"$PartitionedEntities" in content:
-        raise InputDataError("it is partitioned, or of a version that is not read; save it whole, as version 4.1")
+        raise InputDataError("it is partitioned, or of an unsupported version; save it as one file of version 4.1")
     named = re.findall(rb'(\d)\s+(-?\d+)\s+"([^"\n]*)"', content.partition(b"$EndPhysicalNames")[0])
     names = {(int(d), abs(int(tag))): text.decode(errors="replace") for d, tag, text in named}
     tags = _entities(content, binary=head[2] == b"1") if head[1] == b"4.1" else None
@@ -111,7 +111,9 @@ def _elements(mesh: Any, key: str | None, names: Names = lambda _, number: (numb
             continue
         values = mesh.cell_data[key][number]
         if np.ndim(values) > 1 or not np.array_equal(values, np.rint(values)):
-            raise InputDataError(f"its cell data '{key}' are no whole numbers, one a cell; name others in tissue_data")
+            raise InputDataError(
+                f"its cell data '{key}' are not one whole number for each cell; name others in tissue_data"
+            )
         for value in np.unique(values):
             blocks.append((kind, np.asarray(data[values == value], int), names(CORNERS[kind] - 1, int(value))))
     for tag, families in getattr(mesh, "point_tags", {}).items():
