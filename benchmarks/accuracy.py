@@ -1,4 +1,4 @@
-"""How near the estimates come to the truth: same mesh, other mesh, voxels, noise, a tumour, a small filling.
+"""The errors of estimates against the truth: same mesh, other mesh, voxels, noise, a tumour, a small filling.
 
     python benchmarks/accuracy.py [--rows clean,noise,...] [--cases N] [--first-seed S] [--output FILE] [--json]
 
@@ -91,7 +91,7 @@ def max_cases(names: list[str]) -> int:
 
 
 def _case(key: tuple[str, int, int], row: Row, truths: Truths) -> Result:
-    """Make one scene, estimate it, and hold the estimate beside the truth."""
+    """Make one scene, estimate it, and compare the estimate with the truth."""
     name, seed, draw = key
     began = time.perf_counter()
     case = posed(row, seed, draw, truths)
@@ -227,7 +227,7 @@ def true_noise(
     lines = GRIDS * evaluation.linearisations
     rows = [model_to_image(line) for line in lines]
     voxels = fit_noise_model(
-        [0.5 * error[of] for error, of in zip(errors, rows, strict=True)],  # it stands for both directions
+        [0.5 * error[of] for error, of in zip(errors, rows, strict=True)],  # one direction represents both
         [line.residuals.places[of] for line, of in zip(lines, rows, strict=True)],
         [line.residuals.normals[of] for line, of in zip(lines, rows, strict=True)],
     )

@@ -1,4 +1,4 @@
-"""The rows of accuracy.py: random pelves with a known truth, and the inverse problems that their images pose."""
+"""The rows of accuracy.py: random pelves with a known truth, and the inverse problems of their images."""
 
 from __future__ import annotations
 

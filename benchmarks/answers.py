@@ -1,15 +1,15 @@
-"""Whether what is spared changes what is found: rows of accuracy.py estimated with and without all that saves time.
+"""Whether shortcuts change the estimate: rows of accuracy.py estimated with and without all that saves time.
 
     python benchmarks/answers.py [--rows clean,noise,...] [--cases N] [--first-seed S] [--output FILE] [--json]
 
-For each case two estimates from the same images, by one and the same outer loop. One is the product's. The plain one
-knows no reduced model, no frozen factor and no derivative that is not exact: it tries no start, and the
-full model is solved, factorised and differentiated by all moduli and modes wherever the loop leads. It ends at a
-fifth of what the product may leave open. At finite strain it goes on from its own linear estimate. Simulated data.
+Each case is estimated twice from the same images, by the same outer loop. One estimate is Palpate's. The plain one has
+no reduced model, no reused factor, no approximate derivative and no further starts: the full model is solved,
+factorised and differentiated by all moduli and modes at every place. Its stop rule is a fifth of Palpate's. At finite
+strain it continues from its own linear estimate. Simulated data.
 
-The answers are the same where they differ by 0.1 %, or by 0.05 posterior standard deviations where that is more; the
-exit code is 1 where one is not. Where one is not the plain loop is begun again, from the product's answer: it stays
-there where nothing that is spared is to blame, and weights and estimate agree at both places.
+Two answers agree where they differ by at most 0.1 %, or 0.05 posterior standard deviations where that is more. Else the
+exit code is 1, and the plain loop begins again at Palpate's answer. It stays there where the shortcuts are not the
+cause.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Whether what `palpate check` passes can be meshed as `palpate estimate` would, and with how many unknowns.
+"""Whether cases that pass `palpate check` can be meshed as by `palpate estimate`, and with how many unknowns.
 
     python benchmarks/check_against_mesh.py [--seeds 0-19] [--edge MM] [--json]
 

@@ -1,11 +1,11 @@
-"""A cohort of which a tenth of the rows are bad, of every class: exactly those must fail, each with its class.
+"""A cohort in which a tenth of the rows are bad, of every class: exactly those must fail, each with its class.
 
     python benchmarks/cohort_bad.py              # 80 rows, 8 of them bad
     python benchmarks/cohort_bad.py --rows 16
 
-Wrong are: a stage, an image cut short, an organ of a few voxels, noise that leaves nothing to estimate, voxels too
-fine for the memory limit; and while they run, children are crashed (SIGSEGV), stopped until their time is over, and
-killed as often as they are started. Prints JSON; exit code 1 where a row came to something else.
+The bad rows have a wrong stage, a truncated image, an organ of a few voxels, noise that leaves nothing to estimate, or
+voxels too fine for the memory limit. Other rows' processes crash (SIGSEGV), are stopped until their time is over, or
+are killed each time they start. Prints JSON; the exit code is 1 where a row ends differently.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
-"""Cohorts killed at random moments and resumed, beside the one that nobody disturbed.
+"""Cohorts that are killed at random moments and resumed, compared with an undisturbed one.
 
     python benchmarks/cohort_kills.py --engine local --runs 100    # hours: each run computes small real cases
     python benchmarks/cohort_kills.py --engine dask --runs 100
     python benchmarks/cohort_kills.py --engine local --runs 100 --stub    # minutes: rows that only write files
 
-Each run is killed once at a random moment of its time: the whole run, the child that computes, or (dask) the scheduler
-or a Dask worker; then resumed until it ends by itself. Its results must be those of the undisturbed run
-to the last digit, each row with one mark, nothing hidden left. Prints JSON; exit code 1 where a run differs.
+Once in each run, at a random moment, a process is killed: the run itself, the child that computes, or (dask) the
+scheduler or a worker. The run is then resumed until it ends by itself. Its results must equal those of the undisturbed
+run to the last digit, with one mark for each row and no hidden file left. Prints JSON; the exit code is 1 where a run
+differs.
 """
 
 from __future__ import annotations
@@ -111,7 +112,7 @@ def computing(roots: list[int]) -> list[int]:
 
 
 def victim(target: str, run: int, cluster: Cluster | None) -> int | None:
-    """A process to be killed; None where there is none of that kind at the moment."""
+    """A process to kill; None where none of that kind runs at the moment."""
     roots = [run] if cluster is None else cluster.pids("worker")
     choices = {
         "run": [run],
@@ -181,7 +182,7 @@ def disturbed(table: Path, output: Path, cluster: Cluster | None, target: str, a
 
 
 def fault(output: Path, reference: dict[str, Any]) -> str:
-    """What is wrong with a resumed run; empty when it is that which nobody disturbed."""
+    """How a resumed run differs from the undisturbed one; empty where it does not."""
     try:
         found = numbers_of(output)
     except PalpateError as error:

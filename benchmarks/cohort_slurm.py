@@ -1,9 +1,9 @@
-"""A cohort of small real cases on SLURM's job array and on dask-jobqueue, beside the same on this machine alone.
+"""A cohort of small real cases on SLURM's job array and on dask-jobqueue, compared with the same on this machine.
 
     eval "$(benchmarks/cohort_slurm_setup.sh start FOLDER)"    # a SLURM of this machine, where there is none
     python benchmarks/cohort_slurm.py --folder FOLDER_THAT_THE_NODES_SEE
 
-Prints JSON: whether the numbers are the same, and what the queue said. Exit code 1 where they differ.
+Prints JSON: whether the numbers are the same, and the queue's messages. The exit code is 1 where they differ.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""How well two workers share a cohort of small real cases, and what a case costs beyond itself; wants a quiet machine.
+"""How well two workers share a cohort of small real cases, and each case's overhead; needs an otherwise idle machine.
 
     python benchmarks/cohort_speed.py --rows 40
 
-Both runs give a worker one thread. Efficiency: time of one worker over twice that of two. Overhead: the time of the run
-with one worker, from its first to its last row, less the time within the cases (`seconds` of their marks), a row; the
-start of the program and the tables at the end are told beside it. Prints JSON.
+Both runs give each worker one thread. Efficiency is the time of one worker over twice that of two. Overhead is the time
+of the run with one worker, from its first to its last row, less the time within the cases (`seconds` of their marks),
+for each row. The times to start the program and to write the tables are printed separately. Prints JSON.
 """
 
 from __future__ import annotations

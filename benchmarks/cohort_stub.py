@@ -1,10 +1,10 @@
-"""Work that computes nothing, to see what the scheduling of a cohort costs and whether it holds.
+"""Work that computes nothing, to measure and test the scheduling of a cohort.
 
     python benchmarks/cohort_stub.py plan --rows 10000              # a plan of stub work: seconds and memory
     python benchmarks/cohort_stub.py run TABLE OUTPUT [--resume]    # what cohort_kills.py --stub starts
 
 Each row sleeps for a moment and writes a result.json of the size of a real one, through the same staging, lock and
-mark. It says nothing of estimates.
+mark. It does not measure estimates.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def plan(count: int, workers: int) -> dict[str, Any]:
 
 
 def _every(count: int) -> Any:
-    """A listener that tells of each tenth of the rows, and the memory by then."""
+    """A listener that reports each tenth of the rows and the memory so far."""
     seen = [0]
 
     def listen(message: str) -> None:

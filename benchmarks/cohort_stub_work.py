@@ -1,4 +1,4 @@
-"""The work of `cohort_stub.py`, alone, so that the processes that do it start at once."""
+"""The work of `cohort_stub.py` in a file of its own, so that its processes start quickly."""
 
 from __future__ import annotations
 

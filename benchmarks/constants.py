@@ -1,14 +1,13 @@
-"""Whether an answer hangs on the constants of the inversion, on the machine, or on where it begins.
+"""Whether an answer depends on the constants of the inversion, on the machine, or on the starts.
 
     python benchmarks/constants.py [--rows clean,finite-clean] [--only NAME,...] [--seed S] [--edge MM] [--defaults]
         [--json]
 
-Simulated data: rows of accuracy.py. An estimate is made with each number that stands in capitals in `palpate.inversion`
-half and twice as large (shares of a whole at most the mean of themselves and 1); the table says how far the log-moduli
-move, in their posterior standard deviations. So it does for an estimate on another number of processors, for one with
-the solver that is chosen where no factor fits into memory, from starts at moduli e times as large and as small, and
-from one start alone, so far from where it would begin. The exit code is 1 where a constant moves one by more than 0.1,
-or one of these by more than 0.01.
+Simulated data: rows of accuracy.py. Each constant in capitals of `palpate.inversion` is halved and doubled (a share of
+a whole becomes at most the mean of itself and 1). The table says how far the log-moduli move, in their posterior
+standard deviations. It says the same for another number of processors, for the solver that is chosen where no factor
+fits into memory, for starts at moduli e times as large and as small, and for one such start alone. The exit code is 1
+where a constant moves a log-modulus by more than 0.1, or another change by more than 0.01.
 """
 
 from __future__ import annotations

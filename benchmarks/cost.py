@@ -1,11 +1,11 @@
-"""What `palpate check` predicts that an estimate will cost, beside what it costs: unknowns, seconds, memory.
+"""The cost of an estimate as `palpate check` predicts it, and the real cost: unknowns, seconds, memory.
 
     python benchmarks/cost.py [--cases N,N,...] [--mesh-only] [--json]
 
-Each case runs in a process of its own, from label images on disk, so that its peak memory is its own. `check` meshes:
-its unknowns are those of the run. The guess before the mesh, by which `init` chooses an edge length, is told beside
-them. The constants of `palpate.study.cost` are fitted to these runs, so times are worth something on a quiet machine
-only; `--mesh-only` needs none and solves nothing. The random pelves are only meshed: what moves them is no mechanics.
+Each case runs in its own process, from label images on disk, so that its peak memory is measured alone. `check` meshes,
+so its unknowns are those of the run. The guess before the mesh, by which `init` chooses an edge length, is printed,
+too. The constants of `palpate.study.cost` are fitted to these runs, so the machine must be otherwise idle.
+`--mesh-only` only meshes, on any machine. The random pelves are always only meshed, because no mechanics moves them.
 Simulated data.
 """
 

@@ -1,16 +1,16 @@
-"""Whether intervals hold that are stated where the model is wrong, and how wide they are beside the Cramer-Rao limit.
+"""Whether stated intervals hold the truth where the model is wrong, and their width over the Cramer-Rao limit.
 
     python benchmarks/coverage.py [--rows gauss-0.3,bumps,...] [--bodies N] [--draws N] [--first-seed S] [--edge MM]
                                   [--output FILE] [--minutes N] [--json]
 
-Simulated data. A row (coverage_scenes.py) is a kind of body, of errors of its drawing, and of what is measured
-besides. Of each body one whole estimate from the exact surfaces of a finer mesh, with all that the program's defaults
-leave unknown: frame, layers, patchy tissues, Poisson's ratios, offsets. Then each draw moves both images' surfaces, and
-is estimated on that estimate's approximation of the model, which is updated where the draw leads: noise, weights,
-closest points, and what is believed of frame, walls and tissues are found anew; what is spared are the model's first
-responses and two of three starts. It ends within a fifth of a standard deviation. Intervals are those that the program
-states. Surfaces have no voxels, whose place is no part of them. A line of JSON a body and row, as soon as it is done;
-another run with the same file adds to it.
+Simulated data. A row (coverage_scenes.py) is a kind of body, of errors of its drawn surfaces, and of further
+measurements. Each body is estimated once from the exact surfaces of a finer mesh, with all unknowns of the defaults:
+frame, layers, patchy tissues, Poisson's ratios, offsets. Each draw then moves the surfaces of both images. It is
+estimated on that estimate's approximation of the model, which is updated on the way. Noise, weights, closest points and
+the priors of frame, walls and tissues are found anew; the model's first responses and two of three starts are not
+computed again. The search ends within a fifth of a standard deviation. Intervals are those of the program, without the
+position of voxels, because the surfaces have none. Each body and row is a line of JSON in FILE, written as soon as it
+is done; another run with the same file adds to it.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ Result = dict[str, Any]  # a line of JSON
 BodyKey = tuple[str, bool, str, str]  # truth, whether points are measured, the estimate's law and the truth's
 
 OUT = 2.0  # half-widths
-NEARLY = StopRule(step_sd=0.2)  # what an estimate may still move is little beside what noise does
+NEARLY = StopRule(step_sd=0.2)  # the stop rule moves an estimate much less than noise does
 CLEAN = NoiseModel(np.array([2.0 * 0.05**2]), np.array([3.0]))  # of the clean estimate: smaller than any row's
 MOST_TELLING = "field-0.2"  # by whose clean estimate all points are followed: it sees what the others see
 NO_GRID = 3  # draws of a voxel grid, in which nothing is off

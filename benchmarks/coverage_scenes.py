@@ -1,4 +1,4 @@
-"""The rows of coverage.py: bodies with a known truth, the errors of their drawings, and what is measured besides."""
+"""The rows of coverage.py: bodies with a known truth, errors of their drawn surfaces, and further measurements."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ class _Swelling:
 
 
 def _liver(seed: int, law: str, edge_mm: float) -> Scene:
-    """A liver of 84 to 92 mm, a kidney under it, and a stomach beside both that fills by 3.5 to 4.5 mm."""
+    """A liver of 84 to 92 mm, a kidney below it, and next to both a stomach that fills by 3.5 to 4.5 mm."""
     rng = np.random.default_rng([seed, 39])
     turn = rotation_about(rng.normal(size=3), rng.uniform(0.0, 18.0))
     liver = Ellipsoid(np.array([-8.0, 0.0, 12.0]) @ turn.T, rng.uniform([42.0, 28.0, 22.0], [46.0, 32.0, 25.0]), turn)
@@ -242,7 +242,7 @@ def _uneven(skins: Sequence[Skin], rng: np.random.Generator, later: bool) -> lis
 
 
 def _resegmented(skins: Sequence[Skin], rng: np.random.Generator, later: bool) -> list[Array]:
-    """A normal field of 0.1 mm; the later image's organs are smoothed by a Gaussian of 2 mm besides.
+    """A normal field of 0.1 mm; also a Gaussian of 2 mm smooths the later image's organs.
 
     That moves a surface by its mean curvature: a step of width^2 / 2 of the heat equation on it.
     """
@@ -259,7 +259,7 @@ def _resegmented(skins: Sequence[Skin], rng: np.random.Generator, later: bool) -
 
 
 def _shrunk(skins: Sequence[Skin], rng: np.random.Generator, later: bool) -> list[Array]:
-    """Every organ of the later image, and the driver, is smaller by 0.2 mm all around, beside a field of 0.1 mm."""
+    """In the later image every organ and the driver are drawn 0.2 mm smaller, with a field of 0.1 mm."""
     found = _gauss(skins, rng, later, sd_mm=0.1, length_mm=6.0)
     return [own - (SHRUNK_MM if later else 0.0) for own in found]
 
@@ -327,7 +327,7 @@ def _no_reaction(name: str, direction: Array) -> NoReturn:
 class Row:
     """What is drawn: a key of TRUTHS, of NOISES and of POINTS ("": none), the truth's law and the estimate's.
 
-    noise: of a residual, where a Cramer-Rao limit is to stand beside it.
+    noise: of a residual, where a Cramer-Rao limit is computed, too.
     """
 
     name: str

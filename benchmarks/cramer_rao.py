@@ -1,4 +1,4 @@
-"""The Cramer-Rao limit of what surfaces and points tell of moduli: what noise leaves open, whatever the method."""
+"""The Cramer-Rao limit of moduli from surfaces and points: the least error of any unbiased method."""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
-"""What the mesh costs and changes: the same images estimated on meshes of several edge lengths.
+"""How the mesh changes cost and result: the same images estimated on meshes of several edge lengths.
 
     python benchmarks/edge_length.py [--row clean] [--cases 4] [--first-seed 601] [--edges 4,5,6,8] [--meshes 1]
                                      [--output FILE] [--json]
 
-Simulated pelves of a row of accuracy.py. For each edge length: unknowns, the error of ln E, and by which share of the
-95 % interval (of the residuals' noise, the voxels' place left out) the estimate lies off that of the first edge length.
-With several meshes of each edge length, which differ by some per cent of it: the root mean square by which the
-estimates of a body lie off the mean of those of the first edge length, beside the standard deviation that is stated
-(`discretisation_sd`). A line of JSON an estimate; another run with the same file adds to it.
+Simulated pelves of a row of accuracy.py. For each edge length it gives the unknowns, the error of ln E, and the
+distance from the estimate of the first edge length as a share of the 95 % interval (without the position of the
+voxels). `--meshes` makes several meshes of each edge length, which differ by a few per cent. Then it gives the root
+mean square distance of a body's estimates from the mean of the first edge length, and the stated standard deviation
+(`discretisation_sd`). Each estimate is a line of JSON in FILE; another run with the same file adds to it.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def _first(found: list[dict[str, Any]], first_mm: float) -> dict[int, Any]:
 
 
 def _stated_beside_found(found: list[dict[str, Any]], first_mm: float) -> dict[str, Any]:
-    """Of each body and edge length, root mean squares over meshes and organs: off the first edge length, and stated."""
+    """For each body and edge length, root mean squares over meshes and organs: found deviation and stated one."""
     first, cases = _first(found, first_mm), []
     for key in dict.fromkeys((row["seed"], row["edge_mm"]) for row in found if row["edge_mm"] != first_mm):
         rows = [row for row in found if (row["seed"], row["edge_mm"]) == key]

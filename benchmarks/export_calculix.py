@@ -1,7 +1,7 @@
-"""CalculiX solves what we export: displacements and nodal forces beside ours. https://www.calculix.de.
+"""CalculiX solves our exports: its displacements and nodal forces are compared with ours. https://www.calculix.de.
 
-The demo's pelvis lies straight; the turned body slides along planes that are oblique in space, under gravity, a
-pressure that follows its surface and a traction. Displacements are read from .dat (7 digits) and .frd (6 digits).
+The demo's pelvis lies along the axes. The turned body slides along oblique planes, under gravity, a pressure that
+follows its surface, and a traction. Displacements are read from .dat (7 digits) and .frd (6 digits).
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""What other programs make of our exports: CalculiX solves them, the readers of each format read them back.
+"""Our exports in other programs: CalculiX solves them, and readers of each format read them back.
 
     make export-check
     python benchmarks/export_check.py [--edge 12] [--only calculix,gmsh,...] [--json]
 
 The demo's pelvis is estimated three times: linear with P2, neo-Hookean with P2 and with the default element; a body
-that is turned in space and slides, under known loads, twice. Every line has a figure and its limit; a program
-that is not installed is a line without a figure, and the exit code is 5 where a limit is not kept.
+that is turned in space and slides, under known loads, twice. Every line has a figure and its limit. A program that
+is not installed has a line without a figure. The exit code is 5 where a figure exceeds its limit.
 """
 
 from __future__ import annotations

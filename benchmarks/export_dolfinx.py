@@ -1,4 +1,4 @@
-"""What dolfinx reads of palpate.msh and palpate.xdmf, a line of JSON; export_meshes.py runs it in Debian's Python."""
+"""dolfinx reads palpate.msh and palpate.xdmf; prints a line of JSON. export_meshes.py runs it in Debian's Python."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def main() -> None:
-    """Read both files that are named and tell of them."""
+    """Read the two named files and print what they hold."""
     gmsh, dolfinx, io = (import_module(name) for name in ("gmsh", "dolfinx", "dolfinx.io"))
     world = import_module("mpi4py.MPI").COMM_WORLD
     gmsh.initialize()

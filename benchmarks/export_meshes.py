@@ -158,7 +158,7 @@ def closed(surface: Any) -> bool:
 
 
 def dolfinx(results: Results, folder: Path) -> Iterator[Row]:
-    """Debian's dolfinx reads the gmsh file by its gmshio, and what meshio makes of it by XDMF."""
+    """Debian's dolfinx reads the gmsh file by gmshio, and meshio's conversion of it by XDMF."""
     result = any_of(results)
     (path,) = palpate.export(result, folder / "dolfinx", format="gmsh")
     probe = [SYSTEM, "-c", "import dolfinx, gmsh"]

@@ -1,4 +1,4 @@
-"""What every part of the check of our exports has: lines of its table, tissues' volumes, and who is installed."""
+"""Shared by all parts of the export check: lines of its table, tissues' volumes, and which programs are installed."""
 
 from __future__ import annotations
 

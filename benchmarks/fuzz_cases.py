@@ -1,12 +1,12 @@
-"""Spoil cases, --set values and label tables at random: nothing but sentences of their class may come of them.
+"""Damage cases, --set values and label tables at random: each must end in an error message of its class.
 
     python benchmarks/fuzz_cases.py --runs 1000000 --commands 4000 --output fuzz_cases.json
 
-With a fixed seed. A run makes one spoilt input (`spoilt_cases.py`) and reads it with the functions that the command
-line calls. `--commands` cases go through `palpate check` itself, in a process of their own, and through `palpate
-estimate` up to where solving begins. A finding is an exception that is no `PalpateError`, an exit code of another
-class, a sentence with control characters, of several lines or over 2000 letters, a traceback, the request to report a
-bug, more than 2 s of processor time, or another answer of `check` than of `estimate`. Prints JSON.
+The seed is fixed. A run makes one damaged input (`spoilt_cases.py`) and reads it with the functions that the command
+line calls. `--commands` cases go through `palpate check` itself, in their own process, and through `palpate estimate`
+up to where solving begins. These are findings: an exception that is no `PalpateError`; an exit code of another class; a
+message with control characters, several lines or over 2000 letters; a traceback; the request to report a bug; more than
+2 s of processor time; different answers of `check` and `estimate`. Prints JSON.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def outcome(read: Callable[[], object], codes: set[int]) -> Outcome:
     began = time.perf_counter()
     kind, flaw = read_once(read, codes)
     seconds = time.perf_counter() - began
-    if seconds > SLOW_SECONDS:  # or the machine was busy: processor time tells, which is slow to ask for
+    if seconds > SLOW_SECONDS:  # or the machine was busy: processor time decides, which takes long to read
         began = time.thread_time()
         read_once(read, codes)
         seconds = time.thread_time() - began

@@ -1,4 +1,4 @@
-"""Damage files at random and read them: no reader may let a foreign exception out, crash, or take much memory.
+"""Damage files at random and read them: a reader may only raise its own errors, not crash or take much memory.
 
     python benchmarks/fuzz_readers.py --runs 1000000 --output fuzz.json
 

@@ -1,4 +1,4 @@
-"""The same targets as fuzz_readers.py under Atheris: inputs that reach new branches of the readers are bred further.
+"""The targets of fuzz_readers.py under Atheris, which varies inputs that reach new branches of the readers.
 
     pip install atheris
     python benchmarks/fuzz_readers_guided.py --runs 300000

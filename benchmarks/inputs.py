@@ -1,4 +1,4 @@
-"""Does a body give the same moduli whatever file its labels come in? The demo's labels, written in four ways.
+"""Whether a body gives the same moduli from each kind of label file: the demo's labels, written in four ways.
 
     python benchmarks/inputs.py [--inputs masks,dicom-seg,rtstruct] [--keep FOLDER] [--json]
 

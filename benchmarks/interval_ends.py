@@ -1,10 +1,10 @@
-"""Where the profiles of a stated posterior end, on a basis as the estimate left it and on models exact there.
+"""Where interval profiles end, on the estimate's reduced basis and on models that are exact at the ends.
 
     python benchmarks/interval_ends.py [--seeds 401,402,403] [--edge MM] [--law NAME] [--json]
 
-Simulated data: the row `clean` of accuracy.py with the program's defaults. Both are held against a basis that has all
-responses at the ends, too: by how much of ln E each of the four ends is off, `open` where it has none. At finite strain
-it is the basis as which the expansion bends.
+Simulated data: the row `clean` of accuracy.py with the program's defaults. Both are compared with a basis that also has
+all responses at the ends: the error in ln E of each of the four ends, `open` where there is none. At finite strain
+this is the linear law's basis.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How far locking falsifies a modulus: a stiff inclusion, fitted with each element at rising Poisson's ratios.
+"""The error of a modulus by locking: a stiff inclusion, fitted with each element at rising Poisson's ratios.
 
     python benchmarks/locking.py [--finest 24] [--ratios 0.3,0.45,0.49,0.4999] [--json]
 

@@ -1,4 +1,4 @@
-"""Young's moduli of bodies whose stiffness, or its ratio, was measured otherwise: no simulation in it.
+"""Young's moduli of measured bodies, whose stiffness, or its ratio, is known from another source. Not simulated.
 
     python benchmarks/measured.py NAME --data FOLDER [--fit STEPS] [--predict STEPS] [--foot N] [--map] [--alike UM]
         [--bead-sd UM] [--json] [--plot FILE.svg]
@@ -18,7 +18,7 @@ NAME is one of
             --map the inner part's modulus is a field: how far it is from flat, beside its own intervals. --bead-sd
             (0.2) and --alike (0): standard deviation of the errors, and length over which they are alike, um.
 
-Nothing of FOLDER is copied anywhere. Needs meshio: pip install 'palpate[mesh]'.
+Nothing of FOLDER is copied. Needs meshio: pip install 'palpate[mesh]'.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ WEIGHTS_G = {"load52": 52.0, "load101": 101.0}
 BEAM_KG_M3 = 1080.0  # Dragon Skin
 FACE_SD_MM = 0.05  # of a face's points, which follow three markers as a rigid body
 
-# Beads: the box of gel that is meshed, and its inner part (um, which stand for mm).
+# Beads: the meshed box of gel and its inner part, in um that are used as mm.
 GEL_LOW, GEL_HIGH = np.array([60.0, 60.0, 16.0]), np.array([350.0, 350.0, 68.0])
 GEL_CELLS = (14, 14, 4)
 GEL_INNER = 0.5  # of the half width along x and y
@@ -200,7 +200,7 @@ def _tpu_prediction(block: Block, options: Options, step: int, fit: dict[str, An
     folder, unknown = (
         options.folder,
         (0.0, 1e6, 0.0),
-    )  # a force that tells nothing: the fitted one is foretold
+    )  # a force with a huge error: the model predicts it
     data = [_tpu_data(block, folder, step, 1, force=unknown, ends=True)]
     case = _tpu_case(folder, fit["law"], "auto", data)
     case = replace(case, tissues=tuple(replace(t, poisson_ratio=fit["poisson_ratio"]) for t in case.tissues))
@@ -334,7 +334,7 @@ def _flatness(found: StiffnessMap, mean: float) -> dict[str, Any]:
 
 
 def _plot(name: str, found: dict[str, Any], path: Path) -> None:
-    """What was found, each value with its interval, beside what else is known of it."""
+    """The values found, with their intervals, and the values known from elsewhere."""
     rows: list[tuple[str, float, Sequence[float]]] = []
     told: list[tuple[str, float]] = []
     if name == "tpu":

@@ -1,4 +1,4 @@
-"""The most memory that this program has held."""
+"""The peak memory of this process."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ __all__ = ["peak_mb"]
 
 
 def peak_mb() -> float:
-    """Megabytes, on Linux; what getrusage tells of a new process is at least what its parent had."""
+    """Peak memory in MB, on Linux; getrusage would report at least the parent's for a new process."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024.0

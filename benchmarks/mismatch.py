@@ -1,4 +1,4 @@
-"""How near the estimates come to the truth where a pair of images does what real ones do, and the model does not.
+"""The errors of estimates from image pairs with the faults of real ones, which the model does not have.
 
     python benchmarks/mismatch.py [--scenes still,crop,...] [--laws linear,neo-hookean] [--noise clean,0.3] [--bodies N]
         [--first-seed S] [--share k/n] [--scenes-cache FOLDER] [--output FILE.jsonl] [--set key=value ...]
@@ -126,7 +126,7 @@ def _made(key: SceneKey, cache: Path) -> str:
 
 
 def _case(key: SceneKey, cache: Path, overrides: tuple[str, ...], keep: Path | None) -> Result:
-    """One scene estimated, beside its truth; an error is its outcome."""
+    """One scene's estimate with its truth; an error is recorded as its outcome."""
     began = time.perf_counter()
     line: Result = {"scene": key.kind, "seed": key.seed, "law": key.law, "noise_mm": key.noise_mm}
     line |= {"set": list(overrides), "commit": _commit()}
@@ -279,7 +279,7 @@ def read_lines(path: Path) -> dict[Key, Result]:
 
 
 def append_line(path: Path, result: Result) -> None:
-    """One line more, on a line of its own whatever a killed run left."""
+    """Append a line; a broken last line of a killed run is ended first."""
     unfinished = path.exists() and path.read_bytes()[-1:] not in (b"", b"\n")
     with path.open("a") as file:
         file.write("\n" * unfinished + json.dumps(result) + "\n")

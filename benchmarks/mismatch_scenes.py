@@ -1,4 +1,4 @@
-"""The scenes of mismatch.py: simulated pelves whose images do what real pairs do, each a folder with a case.toml.
+"""The scenes of mismatch.py: simulated pelves with the faults of real image pairs, each a folder with a case.toml.
 
 A truth is a random pelvis in a field of 140 x 146 x 146 mm, solved on a mesh finer than the estimate's; scenes of one
 body share it. Truths and scenes are made once and kept in a folder: `scene_folder` gives the scene, made or not.
@@ -45,7 +45,7 @@ from palpate_validation.truth import ScaledMotion
 __all__ = ["KINDS", "SceneKey", "scene_folder"]
 
 Array = NDArray[np.float64]
-Facts = dict[str, Any]  # what is told of a scene, in JSON's types
+Facts = dict[str, Any]  # facts of a scene to print, in JSON's types
 
 VERSION = 1  # of what the seeds mean: a folder of another version is refused
 FIELD_MM = (140.0, 146.0, 146.0)
@@ -80,7 +80,7 @@ class SceneKey:
 
 @dataclass(frozen=True)
 class Truth:
-    """A solved body: displacement (n_points, 3) mm on `space`, and what is told of it."""
+    """A solved body: displacement (n_points, 3) mm on `space`, and facts to print."""
 
     space: LagrangeSpace
     displacement: Array

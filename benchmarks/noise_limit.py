@@ -1,4 +1,4 @@
-"""Whether the Cramer-Rao limit is one: the scatter of its own weights on images with noise, beside what it promises.
+"""A test of the Cramer-Rao limit: the scatter of its weights on noisy images, compared with the limit itself.
 
     python benchmarks/noise_limit.py [--seed S] [--draws N]
 

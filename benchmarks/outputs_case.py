@@ -1,4 +1,4 @@
-"""What the campaigns on outputs share: a case of seconds, a folder with another patient's outputs, and their judgement.
+"""Shared by the campaigns on outputs: a small case, a folder with another patient's outputs, and their judgement.
 
 A folder is *old* when its files are byte by byte those that lay there before the run, *new* when they are those of an
 undisturbed run (times and the page's date aside), each listed with its hash and nothing of the old run beside them.

@@ -1,9 +1,9 @@
-"""A disk that is full at the n-th operation, for every n: the output folder holds the old files or the new ones.
+"""A disk that is full at the n-th operation, for every n: the output folder must hold the old files or the new ones.
 
     python benchmarks/outputs_full_disk.py [--runs 60] [--seed 1] [--folder DIR]
 
 `palpate estimate`, `mesh`, `report` and `init` work in a folder with another patient's outputs. Their numbers are
-computed once; what is repeated is the writing. First, every write, fsync, mkdir, truncation and rename in the folder
+computed once; only the writing is repeated. First, every write, fsync, mkdir, truncation and rename in the folder
 fails in turn with ENOSPC (a failing write leaves half of what it should), alone or with all after it; the counts of
 bytes show that no write of theirs goes by unseen. Then, where tmpfs may be mounted, `--runs` runs of each with a
 random rest of space. Each must end with 0 and the new files (an estimate: or all but its page, which it says), or with
@@ -38,7 +38,7 @@ from palpate.study import read_case
 
 SPACE = 32 * 2**20  # bytes of the small disk
 PAGE = 4096
-# modules whose functions are exchanged for ones that know the answer
+# modules whose functions are replaced by ones that return the known answer
 RUN: Any = importlib.import_module("palpate.study.run")
 NEW_CASE: Any = importlib.import_module("palpate.study.new_case")
 CASE_REPORT: Any = importlib.import_module("palpate.report.case_report")

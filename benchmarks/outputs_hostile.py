@@ -1,11 +1,11 @@
-"""Output folders made by others: nothing outside of them is touched, and every run ends with a code and a sentence.
+"""Hostile output folders: nothing outside may be touched, and every run must end with an exit code and a sentence.
 
     python benchmarks/outputs_hostile.py [--runs 2] [--seed 1] [--folder DIR]
 
 In the place of each file that `palpate estimate`, `mesh`, `report` and `init` write, of their lock, log and hidden
 folder, lies a link (to a file, to a folder, to nothing, to itself), a hard link, a pipe, a socket, a device, a folder
 or a file that may not be written; `--runs` times each, with a random choice of further ones. Then folders of strange
-names: too long, with control characters, not UTF-8. The numbers are computed once; what is repeated is the writing.
+names: too long, with control characters, not UTF-8. The numbers are computed once; only the writing is repeated.
 A run must end with 0 and the new files, or be refused (2, 3, 6) with one sentence and leave everything as it was.
 Prints counts as JSON; `failures` must be empty.
 """

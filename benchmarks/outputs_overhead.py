@@ -1,4 +1,4 @@
-"""What it costs that all outputs take their places together, beside writing each file alone, in turns.
+"""The extra time to replace all outputs together, compared with writing each file alone, in turns.
 
     python benchmarks/outputs_overhead.py [--runs 20] [--folder DIR]
 

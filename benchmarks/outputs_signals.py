@@ -1,4 +1,4 @@
-"""Signals at random moments of a run: the output folder holds the old files or the new ones, and a rerun succeeds.
+"""Signals at random moments of a run: the folder must hold the old files or the new ones, and a rerun must succeed.
 
     python benchmarks/outputs_signals.py [--runs 104] [--seed 1] [--workers 2] [--folder DIR]
 

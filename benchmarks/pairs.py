@@ -1,4 +1,4 @@
-"""What further image pairs of a patient are worth, and what one spoilt pair costs.
+"""How much further image pairs of a patient reduce the error, and how much one spoilt pair adds.
 
     python benchmarks/pairs.py [--patients 20] [--first-seed 701] [--law linear] [--output FILE] [--json]
 
@@ -77,7 +77,7 @@ def _states(scene: Scene, after: LabelImage) -> ImagedStates:
 
 
 def _shifted(scene: Scene, rng: np.random.Generator) -> LabelImage:
-    """The later image with one organ drawn 3 mm beside its place, along a direction in the slice."""
+    """The later image with one organ drawn 3 mm away from its place, along a direction in the slice."""
     label = scene.mesh.tissue_index(SHIFTED) + 1
     rest = scene.mesh.tissue_index("surroundings") + 1
     axis, sign = int(rng.integers(2)), int(rng.choice([-1, 1]))

@@ -1,4 +1,4 @@
-"""Random pelves as hard to mesh as segmentations are: thick slices, thin organs, organs that touch."""
+"""Random pelves that are as hard to mesh as real segmentations: thick slices, thin organs, organs that touch."""
 
 from __future__ import annotations
 

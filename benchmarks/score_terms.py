@@ -1,9 +1,9 @@
-"""What the score of an estimate leaves out: how what follows the material changes, and the slope of ln det H.
+"""Two terms that the score of an estimate leaves out: changing material responses, and the slope of ln det H.
 
     python benchmarks/score_terms.py CASE.toml [CASE.toml ...] [--set KEY=VALUE ...] [--json]
 
-Of cases of one later image, under the linear law. The steps of each log-modulus that each would add to the estimate,
-in its posterior standard deviations sd:
+For cases with one later image, under the linear law. It prints the step that each term would add to each log-modulus,
+in posterior standard deviations sd:
 
 - responses: the displacement is u(E, q) + U(E, q) c with responses U to the material modes c, and the reduced model
   holds U while E and q move. With the change dx of U c along h = H^-1 e_i and the residuals' derivatives S by the
@@ -12,8 +12,8 @@ in its posterior standard deviations sd:
   -(H^-1)_tt d(1/2 ln det H_nn)/dt from the mode of all unknowns together. Its two parts are the changes of the
   responses to the boundary modes, those of the reduced model, and to the material modes, those of the full model.
 
-Where a truth.json with "moduli_kpa" lies beside a case, as in the scenes of mismatch.py, the errors of ln E are told as
-they are, with the steps by the material modes' responses, and with all three.
+Where a truth.json with "moduli_kpa" lies beside a case, as in the scenes of mismatch.py, the errors of ln E are printed
+as they are, with the steps by the material modes' responses, and with all three.
 
 Derivatives are central differences over 0.2 of sd and of ln E.
 """

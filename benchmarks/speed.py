@@ -1,10 +1,10 @@
-"""How fast: an estimate in forward solves, the online gradient beside its peers, the posterior, the cost by mesh size.
+"""Speed: an estimate in forward solves, gradients beside those of other programs, the posterior, the cost by mesh size.
 
     python benchmarks/speed.py [--parts solver,linear,nonlinear,gradient,...] [--quick] [--json]
 
 The body is a simulated pelvis with prostate and bladder to estimate, seen through voxels, with 90 modes of the rectum's
-wall. What is compared is measured in one run, alternating. A peer that is not installed gives null; `make
-benchmark-setup` installs them. Simulated data.
+wall. Compared programs run in turns. A program that is not installed gives null; `make benchmark-setup` installs
+them. Simulated data.
 """
 
 from __future__ import annotations
@@ -358,19 +358,19 @@ def _default(sizes: Sizes, seed: int, say: Say) -> Result:
 
 
 def _signals(sizes: Sizes, seed: int, say: Say) -> Result:
-    """The same beside cases whose images tell more or less."""
+    """The same, with cases whose images contain more or less information."""
     del say
     return {"signals": other_signals(seed, quick=sizes == QUICK)}
 
 
 def _field(sizes: Sizes, seed: int, say: Say) -> Result:
-    """The same with a measured displacement field beside its surfaces."""
+    """The same with a measured displacement field in addition to surfaces."""
     del say
     return {"field": measured_field(seed, quick=sizes == QUICK)}
 
 
 def _map(sizes: Sizes, seed: int, say: Say) -> Result:
-    """What a map of the prostate's stiffness adds to that, and a small one beside torch-fem's of the same data."""
+    """The cost of a map of the prostate's stiffness, and a small map by Palpate and by torch-fem."""
     peer = beside_a_peer(*sizes.map, seed, say)
     return {"map": mapped_organ(seed, quick=sizes == QUICK), "map_beside_torch_fem": peer}
 

@@ -63,7 +63,7 @@ def default_case(seed: int, *, quick: bool) -> dict[str, Any]:
 
 
 def other_signals(seed: int, *, quick: bool) -> dict[str, Any]:
-    """The default case beside others of its size whose images tell more or less, under each law, in one run."""
+    """The default case and others of its size with more or less information, under each law, in one run."""
     found: dict[str, Any] = {}
     for body in BODIES:
         with tempfile.TemporaryDirectory() as name:
@@ -159,7 +159,7 @@ def _write(folder: Path, body: str, seed: int, *, quick: bool) -> None:
 
 
 def _write_field(folder: Path, scene: Scene) -> None:
-    """A case beside the case: with a table of the displacements on a lattice, whose errors are alike nearby."""
+    """A second case with a table of displacements on a lattice, whose errors are correlated in space."""
     low, high = scene.mesh.nodes.min(axis=0), scene.mesh.nodes.max(axis=0)
     spacing = float(np.prod(high - low) / N_POINTS) ** (1.0 / 3.0)
     n = np.ceil((high - low) / spacing).astype(int)

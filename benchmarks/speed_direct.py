@@ -106,7 +106,7 @@ KEYS = ("unknowns", *(f"{name}{unit}" for name in CLOCKS for unit in ("_s", "_cp
 
 
 def beside_each_other(edge_mm: float, seed: int, *, repeats: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """All on one stiffness, each in processes of its own, in turns: medians of seconds, and peak memory; of JSON."""
+    """All solvers on one stiffness, in separate processes and in turns: median seconds and peak memory, for JSON."""
     rows: dict[str, list[dict[str, float | None]]] = {name: [] for name in SOLVERS}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "stiffness.npz"

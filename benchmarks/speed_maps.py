@@ -1,4 +1,4 @@
-"""A map of stiffness by Palpate beside one by torch-fem's adjoint and L-BFGS: the same mesh, data and prior.
+"""A map of stiffness by Palpate and by torch-fem's adjoint with L-BFGS, from the same mesh, data and prior.
 
 Simulated: a cavity that grows moves a shell of 20 mm radius in surroundings of 10 kPa; ln E of the shell is drawn from
 the prior. The wall's motion is known, a displacement field is measured on a lattice. The truth is on a finer mesh.

@@ -1,4 +1,4 @@
-"""What others pay for the same gradient on the same mesh: torch-fem, scikit-fem, finite differences; and our own.
+"""The time of the same gradient on the same mesh by torch-fem, scikit-fem, finite differences, and Palpate.
 
 All get the misfit with closest points and weights frozen, a quadratic form in the surface's displacement, so that what
 is timed is the mechanics. Each returns the gradient (n_unknowns,) of it, or is None when it is not installed.

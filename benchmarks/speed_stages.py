@@ -1,4 +1,4 @@
-"""Where the time of a whole case goes, from label images in memory to intervals, by a profiler."""
+"""The time of each stage of a whole case, from label images in memory to intervals, by a profiler."""
 
 from __future__ import annotations
 

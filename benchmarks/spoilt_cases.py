@@ -1,4 +1,4 @@
-"""Cases, --set values and label tables that are spoilt at random, for `fuzz_cases.py`.
+"""Cases, --set values and label tables that are damaged at random, for `fuzz_cases.py`.
 
 A valid case or table is a tree of values; its structure is changed in up to six places (types, sizes, nesting, huge
 numbers, names of all scripts, keys doubled, moved, mistyped), it is written in one of the spellings that its format

@@ -1,4 +1,4 @@
-"""Whether a map of stiffness finds a stiff ball that nobody has drawn, and finds none where there is none.
+"""Whether a map of stiffness finds a stiff ball that the labels do not show, and finds none where there is none.
 
     python benchmarks/stiffness_maps.py [--bodies N] [--draws N] [--first-seed S] [--field-sd-mm 0.2] [--edge MM]
                                         [--surface-sd-mm 0] [--contrast 3] [--prior total-variation] [--output FILE]
@@ -14,8 +14,7 @@ that may have edges). A line of JSON a draw: whether a
 region was found, with which probability, how far its centre lies from the ball's, its contrast with its interval, how
 much of the prior's variance the data removed, and the share of elements whose ln E lies inside its 95 % interval;
 `in_ball` has the means of ln E over the tissue's and of its standard deviation in the ball, and of the former outside.
-Beside them stands the limit: how many standard deviations of the field's errors are between this ball and none for whom
-all else is known.
+It also gives the limit: the ball's effect in standard deviations of the field's errors, with all else known.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 PalpateError
 ├── ConfigurationError      2   case.toml, flags, keys, impossible values
 ├── InputDataError          3   an image or table that cannot be read or used
-├── GeometryError           4   organs or meshes that cannot be computed with
-│   └── MeshQualityError    4   a mesh that failed its gate
-├── EstimationError         5   no result can be stated
+├── GeometryError           4   organs or meshes that cannot be used in a computation
+│   └── MeshQualityError    4   a mesh that failed its quality check
+├── EstimationError         5   no result was found
 │   ├── SolverError         5   a linear solve failed or did not reach its tolerance
 │   └── NotConverged        5   an iteration stopped before its tolerance
 └── ResourceError           6   memory, disk, a missing optional library
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 
 class PalpateError(Exception):
-    """Anything that Palpate refuses or fails to do; the text says what, where, with which numbers, what to do."""
+    """Anything that Palpate refuses or fails to do; the text says what, where, with which numbers, and what to do."""
 
     exit_code = 1
 
@@ -40,7 +40,7 @@ class GeometryError(PalpateError):
 
 
 class MeshQualityError(GeometryError):
-    """A mesh did not pass its quality gate."""
+    """A mesh did not pass its quality check."""
 
 
 class EstimationError(PalpateError):

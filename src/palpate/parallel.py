@@ -1,8 +1,7 @@
-"""Independent work on several processors: NumPy, SciPy and libigl leave Python's lock while they compute.
+"""Independent work on several processors: NumPy, SciPy and libigl release Python's lock while they compute.
 
-The threads are ours, as many as the `processors` that this process may use; BLAS's own only wait for each other, so
-that its limit is one while ours compute (`multifrontal.blas_on_one_thread`). On one processor nothing waits for a
-thread.
+There are as many threads as `processors` that this process may use. BLAS has one thread while they compute
+(`multifrontal.blas_on_one_thread`), because more would only wait for each other. On one processor no thread is started.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ Result = TypeVar("Result")
 def mapped(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """Results of `function` for each item, in their order, by as many threads as there are `processors`.
 
-    A thread works in the caller's context: what NumPy is told to let pass there is let pass in it. The first exception
-    that a call raises is raised.
+    A thread works in the caller's context, such as NumPy's settings for floating-point errors. The first exception that
+    a call raises is raised.
     """
     if processors() == 1:
         return [function(item) for item in items]
@@ -33,7 +32,7 @@ def mapped(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
 
 
 def both(first: Callable[[], Item], second: Callable[[], Result]) -> tuple[Item, Result]:
-    """Results of two calls that do not hang on each other, as `mapped` has them."""
+    """Results of two independent calls, computed as by `mapped`."""
     calls: tuple[Callable[[], Any], Callable[[], Any]] = (first, second)
     one, other = mapped(lambda call: call(), calls)
     return one, other

@@ -1,6 +1,6 @@
-"""Processes: what memory the machine has left for one, what our own begin with, and how they ended.
+"""Processes: the memory that is left for one, the environment of child processes, and how they ended.
 
-What stands here every image that is read waits for: no library does.
+Every process that reads an image imports this file, so it imports no library.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ else:
     TOLD = True
 
 
-STATED = "PALPATE_MEMORY_GB"  # in the environment: what others leave of a machine that is shared without control groups
+STATED = "PALPATE_MEMORY_GB"  # environment variable: memory for this program where others share the machine
 MACHINE = Path("/proc/meminfo")
 Groups = tuple[tuple[str, str, str], ...]
-# Control groups, version 2 and 1, as a container sees its own: limit, use, and the line of its caches in memory.stat.
+# Control groups, version 2 and 1, as a container sees its own: limit, use, and the name of its caches in memory.stat.
 CGROUPS: Groups = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current", "inactive_file"),
     (
@@ -35,7 +35,7 @@ CGROUPS: Groups = (
 
 
 def available_memory(groups: Groups = CGROUPS, machine: Path = MACHINE) -> float | None:
-    """Bytes that are free on this machine and under its control groups' limit; None where the system does not tell."""
+    """Bytes that are free on this machine and under the control group's limit; None where the system does not say."""
     found = [_of_machine("MemAvailable:", machine), _stated()]
     for limit, use, caches in groups:
         with suppress(OSError, ValueError, IndexError):  # "max": no limit
@@ -47,7 +47,7 @@ def available_memory(groups: Groups = CGROUPS, machine: Path = MACHINE) -> float
 
 
 def peak_memory_gb() -> float | None:
-    """The most memory (GB) that this process has held; None where the system does not tell."""
+    """The most memory (GB) that this process has held; None where the system does not say."""
     if not TOLD:
         return None
     unit = 1 if sys.platform == "darwin" else 1024
@@ -55,9 +55,9 @@ def peak_memory_gb() -> float | None:
 
 
 def total_memory(groups: Groups = CGROUPS, machine: Path = MACHINE) -> float | None:
-    """Bytes that this machine has, or its control groups may have, whatever runs; None where the system does not tell.
+    """Bytes of this machine, or the control group's limit, free or not; None where the system does not say.
 
-    What is decided by it is the same from run to run.
+    It does not depend on other programs, so decisions by it are the same in every run.
     """
     found = [_of_machine("MemTotal:", machine), _stated()]
     for limit, _, _ in groups:
@@ -67,7 +67,7 @@ def total_memory(groups: Groups = CGROUPS, machine: Path = MACHINE) -> float | N
 
 
 def _stated() -> float | None:
-    """What the environment leaves to this program; no limit where that is no plain number."""
+    """Bytes that the environment allows this program; None where that is no plain number."""
     stated = os.environ.get(STATED, "")
     return 1e9 * float(stated) if re.fullmatch(r"[0-9]{1,6}(\.[0-9]{1,6})?", stated) else None
 
@@ -81,12 +81,12 @@ def _of_machine(line: str, machine: Path) -> float | None:
 
 
 def environment_of_child() -> dict[str, str]:
-    """The environment of a process of ours: our places to import from, and one thread."""
+    """The environment of a child process: the same import path, and one thread of linear algebra."""
     places = os.pathsep.join(str(Path(place).resolve()) for place in sys.path if place)
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     return {**os.environ, **threads, "PYTHONPATH": places}
 
 
 def name_of_end(code: int) -> str:
-    """The signal, or the exit code, by which a process ended."""
+    """The signal that ended a process, or its exit code, in words."""
     return {-int(number): number.name for number in signal.Signals}.get(code, f"exit code {code}")

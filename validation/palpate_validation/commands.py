@@ -16,7 +16,7 @@ __all__ = ["add_reproduce", "add_verify"]
 
 Progress = Callable[[str], None]
 
-PROCESSES = 2  # more would need the memory of as many meshes
+PROCESSES = 2  # each holds a mesh in memory
 
 
 def add_reproduce(command: Callable[..., argparse.ArgumentParser]) -> None:
@@ -24,7 +24,7 @@ def add_reproduce(command: Callable[..., argparse.ArgumentParser]) -> None:
     parser = command(
         "reproduce",
         reproduce,
-        what="compute one of the paper's experiments, its numbers beside ours; goes on where it was interrupted",
+        what="repeat one of the paper's experiments beside its numbers; an interrupted run continues",
         folder="palpate-reproduce",
         examples=("palpate reproduce table1", "palpate reproduce figure4 --output figure4"),
     )
@@ -36,7 +36,7 @@ def add_verify(command: Callable[..., argparse.ArgumentParser]) -> None:
     parser = command(
         "verify",
         verify,
-        what="compute the problems with known answers and hold our numbers beside them",
+        what="compute problems with known answers and compare the results",
         folder="palpate-verification",
         examples=("palpate verify --quick", "palpate verify --output verification"),
     )
@@ -56,7 +56,7 @@ def reproduce(arguments: argparse.Namespace, _: Any, outputs: OutputFolder, prog
 
 
 def verify(arguments: argparse.Namespace, _: Any, outputs: OutputFolder, progress: Progress) -> Outcome:
-    """Compute the problems with known answers and hold our numbers beside them; exit code 5 when one is missed."""
+    """Compute the problems with known answers and compare the results with them; exit code 5 when one is missed."""
     from palpate_validation.verify import PROBLEMS, verification
 
     problems = [problem for problem in PROBLEMS if problem.quick or not arguments.quick]

@@ -102,7 +102,7 @@ def redrawn(
 
 @dataclass(frozen=True, slots=True)
 class Grown:
-    """What lies within `by_mm` of `part`."""
+    """A shape grown by `by_mm`: all places within that distance of `part`."""
 
     part: LevelSet
     by_mm: float

@@ -1,8 +1,8 @@
-"""A table of scenes with known answers: what is computed, what was found, and how it is told.
+"""A table of scenes with known answers: how they are computed, combined and written.
 
-A scene is computed once, in parts: what is finished stands in a ledger at once, and an interrupted run goes on where it
-was. Parts that need the same meshes and factorisations make one job, so that one process computes them. A worker
-process has one thread of linear algebra for itself: two processes on two cores are faster than two threads in one.
+Scenes are computed in parts. A ledger keeps every finished part, so that an interrupted run continues where it stopped.
+Parts that need the same meshes and factorisations are one job, which one process computes. A worker process has one
+thread of linear algebra: two processes on two cores are faster than one process with two threads.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Scenes(Generic[FoundT]):
-    """A table of scenes: its name, what it is made under, its jobs, what their parts say together, and its page.
+    """A table of scenes: its name, its settings, its jobs, how their parts are combined, and its page.
 
-    `draw` writes the page, of that file ending. again: the next run computes all anew, not only what has changed.
+    `draw` writes the page, a file with that ending. again: the next run computes all parts anew.
     """
 
     name: str
@@ -74,13 +74,13 @@ class Scenes(Generic[FoundT]):
     again: bool = False
 
     def found(self, ledger: Ledger, *, progress: Progress, workers: int = 1) -> FoundT:
-        """What the parts say, those of the ledger and those that it lacks; raises what a part raises."""
+        """The combined parts, those of the ledger and those computed now; raises what a part raises."""
         return self.conclude(compute(self.jobs, ledger, workers=workers, progress=progress))
 
     def written(self, folder: Path, *, progress: Progress, workers: int = 1) -> FoundT:
-        """Compute what is left of it, write NAME.json and its page to `folder`, and return what was found.
+        """Compute the missing parts, write NAME.json and its page to `folder`, and return the result.
 
-        Finished parts stand in NAME.parts.jsonl there, and count for the same settings and software only. `workers`:
+        NAME.parts.jsonl there keeps finished parts, which are used for the same settings and software only. `workers`:
         processes that share the parts; a script that asks for more than one needs `if __name__ == "__main__"`.
         Raises `PalpateError`s of meshing, solving and writing.
         """

@@ -1,11 +1,11 @@
-"""A later state for the real pelvis: simulated, for the scan that Palpate ships has one state only.
+"""A simulated later state for the real pelvis: the scan that Palpate ships shows one state only.
 
 The labels of a real male pelvis CT (3 mm voxels; Wasserthal et al. 2023, doi 10.1148/ryai.230024) become a mesh that is
-finer than the one that inverts it; the rectum is filled, a neo-Hookean body follows under known moduli, and both states
-of that mesh are turned into label images of 1 mm voxels. The scan ends inside the prostate: below its last slice the
-prostate is completed by the mirror image of its upper part, the rest by the last slice. Surfaces are smoothed more than
-the scan's voxels ask for, as else its stairs of 3 mm would stand in both images. Run
-`python -m palpate_validation.simulated_pelvis` to make the two images again.
+finer than the one that inverts it. The rectum is filled, and a neo-Hookean body with known moduli follows. Both states
+of that mesh are turned into label images of 1 mm voxels. The scan ends inside the prostate. Below its last slice the
+mirror image of the upper part completes the prostate, and the last slice all else. Surfaces are smoothed more than
+usual, because both images would else show the scan's steps of 3 mm. `python -m palpate_validation.simulated_pelvis`
+makes the two images again.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class SimulatedPelvis:
 
 
 def simulate_pelvis(progress: Callable[[str], None]) -> SimulatedPelvis:
-    """Make the truth and its two images; some minutes."""
+    """Make the truth and its two images, which takes some minutes."""
     names = read_label_table(DATA / "labels.json")
     labels = _completed(read_label_image(DATA / "labels.nii.gz", names=names))
     scan = segment(labels, TISSUES)

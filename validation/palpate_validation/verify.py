@@ -1,4 +1,4 @@
-"""The problems with known answers: computed, and told with our numbers beside the known ones."""
+"""The problems with known answers: all of them, their table, and its page."""
 
 from __future__ import annotations
 
@@ -41,19 +41,18 @@ PROBLEMS: tuple[Problem, ...] = (
 SCHEMA = "palpate.verification/1"
 HEAD = """# Verification: problems with known answers
 
-Made by `palpate verify --output verification`, which computes everything below in some minutes, writes this page as
-`verification/verification.md` and ends with exit code 5 when one check fails. `--quick` leaves out
-the slow ones (marked *), which are also left out by continuous integration; `--json` prints the numbers; a run that was
-interrupted goes on where it was. A problem may have several checks: the table has the worst of each, and the list below
-it has them all.
+`palpate verify --output verification` makes this page, `verification/verification.md`, in some minutes. It ends with
+exit code 5 when a check fails. `--quick` leaves out the slow problems (marked *). `--json` prints the numbers. An
+interrupted run continues where it stopped. A problem may have several checks. The table has the worst check of each
+problem, and the list below it has all checks.
 
-A tolerance is what the discretisation can reach and does not depend on the result; exact problems are held to
-round-off. The two of the measured beads (M1) are exceptions: both are chosen to hold. 231 % is a typical error no
-larger than the 95th percentile of the beads' own scatter (at 200 %, three times its median, the neo-Hookean law would
-miss), and 0.45 to 0.5 for the Poisson's ratio is wide enough for the one that fits. So M1 records how far model and
-measurement are apart and tests nothing. It compares motions only: neither the gel's modulus nor the force is known. The
-reference of B7c is ours, for no number is published. B7a's 23.96 belongs to the middle of the free side; the corner, to
-which some pages ascribe it, moves by 25.1.
+A tolerance is what the discretisation can reach, and does not depend on the result. Exact problems have a tolerance
+of round-off. The measured beads (M1) are an exception: their tolerances were chosen to hold. 231 % allows a median
+error up to the 95th percentile of the beads' own scatter. At 200 %, three times the median scatter, the neo-Hookean
+law would fail. For the Poisson's ratio 0.45 to 0.5 is allowed. So M1 records how far model and measurement differ,
+and tests nothing. It compares motions only, because neither the gel's modulus nor the force is known. No number is
+published for B7c, so its reference is our own. B7a's 23.96 belongs to the middle of the free side. Some pages ascribe
+it to the corner, which moves by 25.1.
 """
 
 
@@ -86,7 +85,7 @@ class Verification:
 
 
 def verification(problems: Sequence[Problem]) -> Scenes[Verification]:
-    """The table of these problems; each run computes all of them."""
+    """The table of these problems; each run computes them all."""
     number = {problem.id: (place, problem) for place, problem in enumerate(problems, start=1)}
 
     def rows(name: str, progress: Progress) -> Part:
@@ -109,7 +108,7 @@ def _write_page(found: Verification, path: Path) -> None:
 
 
 def page(found: Verification) -> str:
-    """The page (Markdown) of the documentation that holds our numbers beside the known ones."""
+    """The page (Markdown) with our numbers beside the known ones."""
     rows = found.rows
     ids = list(dict.fromkeys(str(row["id"]) for row in rows))
     verdict = f"failed: {', '.join(found.failed)}" if found.failed else "all within their tolerance"
@@ -134,13 +133,13 @@ def page(found: Verification) -> str:
 
 
 def _share(row: dict[str, Any]) -> float:
-    """The error as a share of what is allowed."""
+    """The error over its tolerance."""
     error = math.inf if row["error_percent"] is None else row["error_percent"]
     return float(error / max(row["tolerance_percent"], 1e-12))
 
 
 def _number(value: float | None) -> str:
-    """Six digits; what is only round-off is told by its size."""
+    """A number with six digits, or below 1e-6 its order of magnitude."""
     if value is None:
         return "none"
     return f"{value:.1e}" if 0.0 < abs(value) < 1e-6 else f"{value:.6g}"

@@ -24,10 +24,10 @@ from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.space import Constraint
 from palpate.progress import Progress, silent
 
-REACH = 0.8  # of ln E, within which it is trusted
-COARSE = 3e-2  # of the forces: for the equilibrium whose stiffness is factorised
-DERIVATIVES = 1e-4  # relative residual: those of a coarse equilibrium, which others replace where they decide
-FEW = 24  # moduli and modes, all of whose derivatives cost less than the iterations that they spare
+REACH = 0.8  # distance in ln E within which the expansion is trusted
+COARSE = 3e-2  # relative residual of the forces at the equilibrium whose stiffness is factorised
+DERIVATIVES = 1e-4  # relative residual of derivatives at a coarse equilibrium; those that decide are replaced later
+FEW = 24  # for so many moduli and modes, all derivatives cost less than the iterations that they save
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Expansion:
         """
         del others  # each state has a tangent stiffness of its own
         there, before = self, self.equilibrium
-        if not at.same_as(self.place):  # from where the expansion says that it is, else from the present one
+        if not at.same_as(self.place):  # start at the displacement of the expansion, else at the present one
             start = self.model.solve(at.moduli, at.coefficients).displacement
             found = before.model.attempt(at.moduli, at.coefficients, start=start, nearby=before.factorisation)
             if not found.converged:
@@ -112,7 +112,7 @@ class Expansion:
         return self._around(from_start(model, at.moduli, at.coefficients, start=start, nearby=nearby))
 
     def _around(self, there: FiniteStrainEquilibrium) -> Expansion:
-        """The expansion around an equilibrium so near that its derivatives still hold there: a third of the price."""
+        """The expansion around an equilibrium near enough to keep the derivatives, which takes a third of the time."""
         model = replace(self.model, moduli=there.moduli, coefficients=there.coefficients, values=there.values)
         return replace(self, model=model, equilibrium=there, counts=self.counts + there.counts)
 
@@ -142,7 +142,7 @@ def expansion_around(coarse: FiniteStrainEquilibrium, *, tolerance: float, progr
         near = coarse.refactorised()
         progress("finite strain: the equilibrium on it")
         found = from_start(full, moduli, coefficients, start=near.displacement, nearby=near.factorisation)
-    except SolverError:  # a slender body is stable in equilibrium, and not near it
+    except SolverError:  # a slender body may be stable at its equilibrium, but not near it
         progress("finite strain: not stable there, hence the equilibrium first")
         near = from_start(full, moduli, coefficients, start=coarse.displacement, nearby=None).refactorised()
         found = near

@@ -19,14 +19,14 @@ from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import SOLVERS, CheckedFactorisation
 from palpate.mesh.space import Constraint
 
-SERIES = 40  # vectors at the most
-FAR = 30.0  # spread of the moduli's ratios to the factorised ones, beyond which a new factorisation costs less
-FAR_ALONE = 300.0  # the same for a single right-hand side, of some 4 sqrt(spread) iterations
-SNAPSHOT = 1e-5  # relative residual of basis vectors: what they miss is measured at each place and added there
+SERIES = 40  # largest number of vectors of a series
+FAR = 30.0  # largest over smallest ratio of moduli to the factorised ones, beyond which factorising anew is cheaper
+FAR_ALONE = 300.0  # the same for a single right-hand side, which takes some 4 sqrt(spread) iterations
+SNAPSHOT = 1e-5  # relative residual of basis vectors; their error is measured, and corrected, at each place
 DISPLACEMENT, TANGENT = 3e-4, 1e-2  # of the reduced model's error, that a correction may leave
-STALE = 0.3  # of ln E, from which on all responses to the material modes are made anew
-MANY = 128  # responses to material modes, as those of a map, that cost more by iterations than by a factor of their own
-FAR_OFF = 3e-3  # of the displacement, missing: derivatives are off by as small a share
+STALE = 0.3  # change of ln E after which all responses to the material modes are made anew
+MANY = 128  # responses to material modes, as of a map, for which a new factorisation is cheaper than iterations
+FAR_OFF = 3e-3  # missing share of the displacement, below which derivatives are wrong by as small a share
 MAX_ITERATIONS = 120
 
 
@@ -88,14 +88,14 @@ class ReducedBasis:
         ratios, every = at.moduli / near.moduli, at.directions is not None and self._stale(at)
         many = every and model.material.n_modes > MANY
         far = FAR if at.directions is not None else FAR_ALONE
-        # solutions that iterate themselves help none; many right-hand sides are worth a factorisation of their own
+        # a solver that iterates is no preconditioner; for many right-hand sides a new factorisation pays
         if many or not direct or ratios.max() >= far * ratios.min():
             there = [other.system for other in others if other.serves(model, at.moduli)]
             near = there[0].of(model) if there else model.system(at.moduli)
             sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=int(not there)))
         displacement, along = self._homogeneous(at), _Directions.at(at, model, every=every)
         product = partial(model.free_forces, at.moduli)
-        new = int(not at.same_as(self.place))  # whether the displacement is sought, too
+        new = int(not at.same_as(self.place))  # whether the displacement is solved for, too
 
         def solved(rhs: NDArray[np.float64], tolerance: float | NDArray[np.float64]) -> NDArray[np.float64]:
             """Solution (n_free, k) mm at the place to a relative residual, one or (k,)."""

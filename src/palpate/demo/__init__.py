@@ -1,4 +1,4 @@
-"""The demo: the whole estimate on a real anatomy whose later state is simulated with known moduli."""
+"""The demo: a complete estimate on a real anatomy, whose later state is simulated with known moduli."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from palpate.study import CaseResult, estimate, read_case
 __all__ = ["DATA", "FILLING_MM", "LAW", "TISSUES", "TRUTH_EDGE_MM", "run_demo"]
 
 DATA = Path(__file__).parent / "data"
-# how the later state was simulated, and with which moduli (kPa)
+# how the later state was simulated, and the true moduli (kPa)
 FILLING_MM = 8.0
 LAW = "neo-hookean"
 TRUTH_EDGE_MM = 5.0
@@ -34,9 +34,9 @@ NOTE = (
 
 
 def run_demo(output: Path, progress: Progress) -> CaseResult:
-    """Estimate prostate and bladder of the simulated pelvis and set the truth beside them.
+    """Estimate prostate and bladder of the simulated pelvis; the result holds the true moduli beside the estimates.
 
-    `output` is where the caller writes the result; the images come with the package.
+    `output`: the folder where the caller writes the result. The images are part of the package.
     """
     progress(f"demo: real anatomy, simulated later state; results go to {output}")
     case = read_case(DATA / "demo.toml")

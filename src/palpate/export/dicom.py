@@ -80,7 +80,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path, source: Path | Non
         "segmentation.dcm": _segmentation(highdicom, slices, volume, body, common),
     }
     for name, dataset in made.items():
-        if source is None:  # every reference to the placeholder goes, which nobody could find
+        if source is None:  # references to the placeholder are removed, because it does not exist as a file
             for reference in ("ReferencedSeriesSequence", "SourceImageSequence", "ReferencedImageEvidenceSequence"):
                 if reference in dataset:
                     delattr(dataset, reference)
@@ -195,7 +195,7 @@ def _segmentation(
 
 
 def _placeholder() -> Dataset:
-    """A slice of nobody, from which patient, study and frame of reference are taken where there is no series."""
+    """An anonymous slice, which gives patient, study and frame of reference where there is no series."""
     highdicom, pydicom = import_module("highdicom"), import_module("pydicom")
     found: Dataset = pydicom.Dataset()
     found.file_meta = pydicom.dataset.FileMetaDataset()

@@ -25,15 +25,15 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.parallel import mapped
 
-BORDER_VOXELS = 3.0  # nearer to the image's border the map continues what it cannot see
+BORDER_VOXELS = 3.0  # nearer to the image's border a map is extrapolated
 MAX_POINTS = 20_000
 MIN_POINTS = 30
 MAX_STEPS = 50
 STEP_TOLERANCE_MM = 1e-5
 TUKEY = 4.685  # 95 % efficiency for Gaussian residuals
-EXTRA_SMOOTHING = 0.8  # voxels; a rigid surface keeps its shape, so a wide Gaussian takes its stairs and biases nothing
-LOOSE_VOXELS = 0.5  # a piece that lies further off the motion of the whole moves by itself
-UNDETERMINED = 4e-3  # (lever / radius)^2 of a turn; the stairs left on a ball give 2e-3 at any radius
+EXTRA_SMOOTHING = 0.8  # voxels; a rigid surface keeps its shape, so that smoothing its voxel steps makes no bias
+LOOSE_VOXELS = 0.5  # distance from the whole tissue's motion, beyond which a piece moves by itself
+UNDETERMINED = 4e-3  # (lever / radius)^2 below which a rotation is undetermined; voxel steps on a ball give 2e-3
 
 
 class Motion(Protocol):
@@ -123,7 +123,7 @@ class Alignment:
 
 @dataclass(frozen=True, slots=True)
 class _Match:
-    """Surface points of the before image with their rest distance (n,) mm, and the after map they are laid on."""
+    """Surface points of the first image with their rest distance (n,) mm, and the later map to match them with."""
 
     surface: IsosurfacePoints
     rest: NDArray[np.float64]
@@ -175,7 +175,7 @@ def fit_rigid_motion(pairs: Sequence[tuple[DistanceMap, DistanceMap]]) -> RigidF
     aim, aimed = _moments(target)
     best = _descend(RigidMotion(np.eye(3), aim - centre), matches)
     if _scale(best) > 0.25 * voxel:
-        # the four proper rotations that lay the principal axes of one surface on those of the other
+        # the four proper rotations that map the principal axes of one surface to those of the other
         first, second = (np.linalg.eigh(covariance)[1] for covariance in (spread, aimed))
         turns = [second @ np.diag(signs) @ first.T for signs in product((1.0, -1.0), repeat=3)]
         starts = [RigidMotion(turn, aim - turn @ centre) for turn in turns if np.linalg.det(turn) > 0.0]
@@ -213,7 +213,7 @@ def align(before: Segmentation, after: Segmentation) -> Alignment:
         places = seen_surface(here).places
         places = places[within_border(there.grid, fit.motion.apply(places))]
         nearest = np.clip(np.rint(here.grid.index(places)).astype(int), 0, np.array(pieces.shape) - 1)
-        number = ndimage.grey_dilation(pieces, size=(3, 3, 3))[tuple(nearest.T)]  # the surface lies beside the voxels
+        number = ndimage.grey_dilation(pieces, size=(3, 3, 3))[tuple(nearest.T)]  # the surface lies outside the voxels
         distance = np.abs(there.at(fit.motion.apply(places)) - here.at(places))
         shown = [distance[number == piece] for piece in range(1, count + 1)]
         return fit, max((float(np.median(one)) for one in shown if len(one) >= MIN_POINTS), default=0.0)
@@ -300,7 +300,7 @@ def _descend(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
 
 
 def _state(motion: RigidMotion, matches: Sequence[_Match]) -> _State:
-    """Residuals and derivatives at a motion; points that leave the after image's inside get no area."""
+    """Residuals and derivatives at a motion; points that leave the later image get the area 0."""
     groups = [motion.apply(match.surface.places) for match in matches]
     places = np.concatenate(groups)
     area = np.concatenate([match.surface.area for match in matches])

@@ -11,8 +11,8 @@ from palpate.images.label_image import VoxelGrid
 
 AIR_HU = -400.0  # half way from air to fat and muscle
 CERTAINLY_AIR_HU = -500.0  # which a CT of a body has and an MR image has not
-COARSE_MM = 2.0  # voxels are left out so that those that are looked at are about as large
-THIN_MM = 4.0  # sheets of up to twice this width, as tables and blankets, are no part of the body
+COARSE_MM = 2.0  # coarser sampling, so that the voxels in use have about this size
+THIN_MM = 4.0  # sheets of up to twice this thickness, such as tables and blankets, do not belong to the body
 
 
 def outside_body(values: NDArray[np.float32], grid: VoxelGrid, on: VoxelGrid) -> NDArray[np.bool_]:
@@ -32,7 +32,7 @@ def outside_body(values: NDArray[np.float32], grid: VoxelGrid, on: VoxelGrid) ->
     reach = np.maximum(np.rint(THIN_MM / np.linalg.norm(affine[:3, :3], axis=0)), 1).astype(int)
     steps = np.meshgrid(*[np.arange(-r, r + 1) / (r + 0.5) for r in reach], indexing="ij")
     ball = np.asarray(sum(step**2 for step in steps) <= 1.0)
-    around = np.pad(solid, [(r, r) for r in reach], mode="edge")  # where the image ends, the body goes on
+    around = np.pad(solid, [(r, r) for r in reach], mode="edge")  # beyond the image the body continues
     parts, count = ndimage.label(ndimage.binary_opening(around, ball))
     core = parts == 1 + np.argmax(np.bincount(parts.ravel(), minlength=2)[1:]) if count else around
     body = ndimage.binary_dilation(core, iterations=2 * int(reach.max()), mask=around)  # the corners again

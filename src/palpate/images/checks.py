@@ -17,24 +17,24 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 
-STILL_VOXELS = 0.15  # mean motion of a surface, in voxels, that the voxels' own rounding makes
+STILL_VOXELS = 0.15  # mean motion of a surface, in voxels, by rounding alone
 OBSERVED = (Role.ESTIMATE, Role.DRIVER, Role.RIGID)
 VOLUME_CHANGE = 0.05  # no modulus explains a filling between the scans
-VOLUME_IMPLAUSIBLE = 0.30  # of an organ: no deformation, and hardly a filling, changes so much
+VOLUME_IMPLAUSIBLE = 0.30  # volume change that no deformation, and hardly a filling, can make
 SMALL_VOXELS = 50
 THIN_VOXELS = 4
 THIN_SHARE = 0.2
 COMMON_SHARE = 0.5
 ON_FACE = 1e-6  # voxels: rounding of a point on an image's outer face
-FAR_SHARE = {Role.ESTIMATE: 0.5}  # of its size, by which the middle of a solid organ hardly moves; of others all of it
-SPACING_MM = (0.02, 20.0)  # outside of this a voxel edge is more likely in metres or micrometres
-MIRROR_CERTAIN = 0.25  # gain in agreement, of 1, at which a mirrored image is refused
+FAR_SHARE = {Role.ESTIMATE: 0.5}  # of its size: a solid organ hardly moves further; others by all of it
+SPACING_MM = (0.02, 20.0)  # range of a voxel's edge; outside it is more likely in metres or micrometres
+MIRROR_CERTAIN = 0.25  # gain in agreement (at most 1) at which an image is refused as mirrored
 MIRROR_LIKELY = 0.10
 MIRROR_SAMPLES = 4000
-VOID_INSIDE = 0.25  # of a void's surface that is a cut of the image; more has the air around a body
-VOID_STILL = 2.0  # times the motion that the voxels' own rounding makes
+VOID_INSIDE = 0.25  # largest share of a void's surface on the image's cut; the air around a body has more
+VOID_STILL = 2.0  # factor on the motion by rounding alone
 DIRECTIONS = ("left-right", "front-back", "head-foot")
-SAME_SPACING, NEARLY_SAME_SPACING = 5e-4, 0.02  # relative: rounding in a header, and what no other protocol explains
+SAME_SPACING, NEARLY_SAME_SPACING = 5e-4, 0.02  # relative: rounding in a header; too little for another protocol
 HALF_VOXEL = 0.02  # voxels, by which an offset is half of one
 
 
@@ -51,7 +51,7 @@ def wall_motion(before: Segmentation, after: Segmentation, tissue: int) -> float
 
 
 def _outside(one: Segmentation, other: Segmentation, tissue: int) -> int:
-    """Number of the tissue's voxels in one image that are not its own in the other, within that one's field of view."""
+    """Number of the tissue's voxels in one image that another tissue has in the other, within its field of view."""
     count = 0
     for voxels in one.voxels(tissue):
         index = np.rint(other.grid.index(one.grid.world(voxels.astype(float)))).astype(np.int64)
@@ -265,9 +265,9 @@ def share_inside(grid: VoxelGrid, other: VoxelGrid) -> float:
 def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:
     """Lay the organs of one image on the other, as they are and mirrored along one, two or three axes.
 
-    The agreement is the mean over the organs of the share of voxels that find their own organ; the organs' common
-    centroids are laid on each other, so neither a shift nor the size of the field of view matters. Where exchanging the
-    labels of two organs makes them agree much better, and by as much as a mirror does, that is told instead.
+    The agreement is the mean over the organs of the share of voxels that lie in the same organ of the other image. The
+    organs' common centroids are matched first, so that a shift or the size of the field of view does not matter. Where
+    exchanging the labels of two organs improves the agreement as much as a mirror, the exchange is reported instead.
     """
     points = []  # of each organ at most MIRROR_SAMPLES voxel centres (n, 3), evenly picked, RAS mm
     for i in observed:
@@ -313,7 +313,7 @@ def _mirrored(before: Segmentation, after: Segmentation, observed: Sequence[int]
 def _shifts(before: Segmentation, after: Segmentation, observed: Sequence[int], name: str) -> list[Finding]:
     """Organs that move by more than half of their size, and drivers by all of it.
 
-    Measured against the rigid tissues where there are any; what an alignment has taken out is not in it.
+    The motion is relative to the rigid tissues where there are any, and after the alignment.
     """
     shift = {i: after.middle(i) - before.middle(i) for i in observed}
     rigid = [shift[i] for i in observed if before.tissues[i].role is Role.RIGID]
@@ -361,7 +361,7 @@ def _volume_change(before: Segmentation, after: Segmentation, i: int, name: str)
 
 
 def _moving_void(before: Segmentation, after: Segmentation, i: int, name: str) -> list[Finding]:
-    """A void inside the body, such as a rectum, whose wall moves: nothing of the model moves it."""
+    """A void inside the body, such as a rectum, whose wall moves although the model does not move it."""
     tissue, mask = before.tissues[i], before.mask(i)
     if tissue.role is not Role.VOID or not mask.any() or not after.mask(i).any():
         return []

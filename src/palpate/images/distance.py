@@ -12,11 +12,11 @@ from palpate.errors import InputDataError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 
-PROBIT_LIMIT = 2.5  # beyond so many sigma the smoothed indicator has lost the distance to rounding
-TRUNCATED = 5.0  # sigma, beyond which the Gaussian is none
-COHERENCE = 1.7  # variance times correlation area of the rounding on a patch along a grid plane, in voxel edges^4
-BORDER = 1.0  # voxels: nearer to the image's border the map is a continuation, not a measurement
-REACH_MM = 25.0  # organs that move further are not found again
+PROBIT_LIMIT = 2.5  # sigma, beyond which rounding hides the distance in the smoothed indicator
+TRUNCATED = 5.0  # sigma, at which the Gaussian is cut off
+COHERENCE = 1.7  # variance times correlation area of rounding on a patch along a grid plane, in voxel edges^4
+BORDER = 1.0  # voxels: nearer to the image's border the map is extrapolated, not measured
+REACH_MM = 25.0  # largest motion of an organ that is still found
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ def distance_map(mask: NDArray[np.bool_], grid: VoxelGrid, *, smoothing_mm: floa
     """
     limit, size = PROBIT_LIMIT * smoothing_mm, float(np.linalg.norm(grid.spacing * grid.shape))
     values = np.full(mask.shape, size if far else limit)
-    if mask.any():  # the smoothed indicator is none but around the mask
+    if mask.any():  # the smoothed indicator is zero except around the mask
         box = window_around(mask, grid, reach_mm=TRUNCATED * smoothing_mm + float(grid.spacing.max()))
         within = mask[box]
         if far and mask.all():
@@ -140,7 +140,7 @@ def window_around(mask: NDArray[np.bool_], grid: VoxelGrid, *, reach_mm: float =
     window = [slice(None)] * 3
     for axis, reach in enumerate(np.ceil(reach_mm / grid.spacing).astype(int)):
         others = tuple(a for a in range(3) if a != axis)
-        # what lies beyond the axes before is empty
+        # beyond the axes before, the array is empty
         there = np.flatnonzero(mask[tuple(window)].any(axis=others))
         window[axis] = slice(max(int(there[0]) - reach, 0), min(int(there[-1]) + 1 + reach, mask.shape[axis]))
     return (window[0], window[1], window[2])

@@ -14,12 +14,12 @@ from typing import Any
 from palpate.errors import InputDataError
 
 CHUNK = 2**20  # bytes
-# O_NONBLOCK: a pipe that nobody writes to holds nobody
+# O_NONBLOCK: a pipe without a writer does not block
 FLAGS = sum(getattr(os, name, 0) for name in ("O_RDONLY", "O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
 
 
 class _Digested(io.FileIO):
-    """A file that is digested as it is read, from its start on."""
+    """A file whose SHA-256 is computed while it is read from its start."""
 
     def __init__(self, descriptor: int) -> None:
         super().__init__(descriptor, "rb")
@@ -38,7 +38,7 @@ class _Digested(io.FileIO):
         return content
 
     def seekable(self) -> bool:
-        """Never: what is passed over would not be digested."""
+        """False, because skipped bytes would not be in the digest."""
         return False
 
 

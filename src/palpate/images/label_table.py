@@ -32,15 +32,15 @@ CLASSES: Mapping[str, Mapping[str, int]] = {
     for task, names in json.loads(TOTALSEGMENTATOR.read_text("utf-8")).items()
 }
 MAX_BYTES = 2**20
-MAX_LINE = 1000  # letters: patterns are tried from each of them
+MAX_LINE = 1000  # letters of a line, because patterns are tried from each of them
 ENDINGS = (".csv", ".ctbl", ".json", ".label", ".tsv", ".txt")
 COLOUR = re.compile(r"#[0-9a-f]{6}")
 COLUMNS = ("LabelValue", "Name", "Color_R", "Color_G", "Color_B", "Color_A")
 AS_NUMBERS = "write the numbers as the label of a tissue in the case"
-DIGITS = re.compile(r"[0-9]{1,9}")  # not what int() takes besides: blanks, signs, 1_0, digits of other scripts
+DIGITS = re.compile(r"[0-9]{1,9}")  # int() would also accept blanks, signs, 1_0 and digits of other scripts
 COLOURS = r"(?P<red>[0-9]{1,3})\s+(?P<green>[0-9]{1,3})\s+(?P<blue>[0-9]{1,3})"
 ITKSNAP_ROW = re.compile(r"(?P<label>[0-9]{1,9})\s+" + COLOURS + r'(?:\s+[0-9.eE+-]{1,20})*\s+"(?P<name>[^"]*)".*')
-# 3D Slicer passes over what follows the opacity
+# 3D Slicer ignores what follows the opacity
 SLICER_ROW = re.compile(
     r"(?P<label>[0-9]{1,9})\s+(?P<name>\S.*?)\s+" + COLOURS + r"(?:\s+[0-9.]{1,20}(?:\s+[^0-9\s].*)?)?"
 )
@@ -155,7 +155,7 @@ def _json_rows(text: str) -> tuple[list[NamedLabel], str]:
     if not isinstance(pairs, _Pairs) or not pairs:
         raise ValueError('names no label; write {"1": "prostate"}')
     numbers, rows = dict[str, list[int]](), []
-    for key, given in pairs:  # whichever side holds the number
+    for key, given in pairs:  # the number may stand on either side
         several = given if isinstance(given, list) and {type(each) for each in given} == {int} else []
         if len(set(several)) > 1:
             numbers[key] = several

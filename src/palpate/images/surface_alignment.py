@@ -26,7 +26,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 
 SMOOTHER = 2.0  # times the usual smoothing: it takes the stairs of the voxels, and does the same to both images
-MOST_POINTS = 400  # of one surface: those between them say the same
+MOST_POINTS = 400  # points of one surface; those between them add no information
 LEAST_POINTS = 30
 LENGTH_MM = 40.0  # over which an organ's own motion is alike
 OWN_MOTION_MM = {  # standard deviation of each component of a surface's own motion

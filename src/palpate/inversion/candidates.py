@@ -66,7 +66,7 @@ def concluded(ends: Sequence[Candidate], starts: Sequence[StartRun], rest: Evalu
     groups = grouped([end.minimum for end in ends], n)
 
     def rank(i: int) -> tuple[bool, bool, int]:
-        """A minimum is stood for by the one followed first, else by one that converged."""
+        """Which minimum represents its group: the one that was followed first, else one that converged."""
         return i != 0, not ends[i].minimum.converged, i
 
     of_group = [[i for i, of in enumerate(groups) if of == group] for group in range(max(groups) + 1)]

@@ -22,8 +22,8 @@ from palpate.inversion.trust_region import (
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium
 from palpate.progress import Progress
 
-RELEASED = replace(NEAR, all_material=False)  # whether images tell of what was fixed hangs on what decides alone
-EQUILIBRIUM = 1e-5  # of the forces, while the estimate moves
+RELEASED = replace(NEAR, all_material=False)  # the deciding directions are enough to judge whether layers are seen
+EQUILIBRIUM = 1e-5  # relative residual of the forces while the estimate still moves
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,16 +116,16 @@ def at_finite_strain(near: OuterIterate, bounds: Bounds, *, rule: StopRule, prog
     at = near.minimum
     begin = begun(objective.under(first), at.unknowns, history=at.history, evaluations=at.evaluations)
     start = [replace(begin, checks=near.counts)]
-    del coarse, first, begin, objective  # no longer needed where the loop goes on, and large
+    del coarse, first, begin, objective  # large, and no longer needed
     end = minimised(start.pop(), bounds, rule, progress=progress, title="finite strain")
     progress("finite strain: the exact equilibrium at the estimate")
     return end.at_equilibrium()
 
 
 def _coarse(linear: OuterIterate) -> tuple[Objective, list[FiniteStrainEquilibrium]]:
-    """The objective of a linear minimum on no approximation, and the coarse equilibria there of every state.
+    """The objective of a linear minimum without approximations, and the coarse equilibrium of every state there.
 
-    Its states bend as the linear law does.
+    Far from the minimum its states follow the linear law's reduced basis.
     """
     before, points = linear.objective, linear.objective.linearisation_points(linear.minimum.unknowns)
     found, states = list[FiniteStrainEquilibrium](), list[LaterState]()

@@ -23,8 +23,8 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns.blocks import Acts, Block
 from palpate.unknowns.parameters import ParameterMap
 
-LEAST_VARIANCE = 1e-3  # of a coefficient of a motion, in its unit: no mode is forbidden
-FITTED = 0.5  # of a kind's residuals, the largest share that is taken for fitted by the unknowns
+LEAST_VARIANCE = 1e-3  # of a motion's coefficient, in its unit, so that no mode is excluded
+FITTED = 0.5  # largest share of a kind's residuals that counts as fitted by the unknowns
 
 LogEvidence = Callable[[NDArray[np.float64]], tuple[float, NDArray[np.float64]]]
 """A log-evidence F and dF / d v_t (n_terms,) at the variances v_t (n_terms,) of a prior's terms."""
@@ -74,7 +74,7 @@ def with_scales(objective: Objective, evaluation: Evaluation) -> Objective:
 
 
 def _scale(linearisations: Sequence[Linearisation], inverse: NDArray[np.float64], least: float) -> float:
-    """That of some observations' residuals, mm, at least `least`; inverse (n, n): H^-1."""
+    """The scale (mm) of some observations' residuals, at least `least`; inverse (n, n): H^-1."""
     count = sum(term.observation.weighting.count for term in linearisations)
     determine = 0.0
     for term in linearisations:
@@ -86,7 +86,7 @@ def _scale(linearisations: Sequence[Linearisation], inverse: NDArray[np.float64]
     determine = min(determine, FITTED * count)
 
     def worse(log_sd: float) -> float:
-        """What the objective has of it at ln s."""
+        """The part of the objective that depends on ln s."""
         total = -determine * log_sd
         for term in linearisations:
             weighting = term.observation.with_sd(float(np.exp(log_sd))).weighting
@@ -140,7 +140,7 @@ class _Whitened:
 
     @classmethod
     def of(cls, information: NDArray[np.float64], pull: NDArray[np.float64]) -> _Whitened:
-        """Those in the data's own directions: what rounding makes is left out, but for the one that is seen most."""
+        """Root and target along the eigenvectors of A; those by rounding alone are left out, but never all."""
         sizes, vectors = linalg.eigh(information, check_finite=False)
         number = np.finfo(np.float64)
         kept = sizes > len(sizes) * number.eps * sizes[-1]
@@ -196,7 +196,7 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     model = normal_model(parameters, evaluation, unknowns)
 
     def choice(i: int) -> tuple[float, int, Belief]:
-        """What a block gains by its best alternative, the number of the one it takes, and what that one believes."""
+        """The gain of a block's best alternative, the number of the one it takes, and that one's covariance."""
         block, beliefs = parameters.blocks[i], model.beliefs(i, chosen)
         best = max(range(len(beliefs)), key=lambda k: beliefs[k].evidence)
         present = chosen[i] if chosen[i] in range(len(beliefs)) else None
@@ -252,7 +252,7 @@ def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[n
 
 
 def _admissible(blocks: Sequence[Block], number: int, chosen: Sequence[int | None]) -> Block:
-    """A block with the alternatives that are left to it by those `chosen` for the others (see `Block.rivals`)."""
+    """A block with the alternatives that other blocks' choices leave to it (see `Block.rivals`)."""
     block = blocks[number]
     rivals = any(k for other, k in zip(blocks, chosen, strict=True) if other.cause in block.rivals)
     return replace(block, alternatives=block.alternatives[:-1], odds=block.odds[:-1]) if rivals else block

@@ -19,7 +19,7 @@ from palpate.observation.jacobian import Jacobian, jacobian_of
 from palpate.parallel import mapped
 from palpate.unknowns.parameters import ParameterMap
 
-DRIVER_LN_SD = float(np.log(2.0))  # of a driver's scale over that of its kind: how far its modes cannot follow it
+DRIVER_LN_SD = float(np.log(2.0))  # standard deviation of ln of a driver's scale over that of its kind
 AS_GOOD = 1.92  # of minus the log posterior: half the 95 % quantile of chi-squared with one degree of freedom
 
 
@@ -87,7 +87,7 @@ class Linearisation:
         residuals = observation.weighed(replace(self.residuals, values=values))
         weights, precision = _robust_weights(observation, residuals), observation.weighting.precision
         change, information = precision * (weights - self.weights), None
-        if np.count_nonzero(change) <= self.jacobian.by_displacement.shape[1]:  # else the whole costs less
+        if np.count_nonzero(change) <= self.jacobian.by_displacement.shape[1]:  # else forming it anew is cheaper
             scaled = precision / self.precision * self.information
             information = self.jacobian.changed_gram(scaled, change)
         return Linearisation.of(observation, self.state, residuals, self.columns, self.jacobian, weights, information)
@@ -216,7 +216,7 @@ class Objective:
         if evaluation is None:
             return [LinearisationPoint(moduli, q) for q in coefficients]
         directions, points = deciding_directions(evaluation, mapping.n_parameters), []
-        if any(block.released for block in mapping.blocks):  # those that decide where they are free, too
+        if any(block.released for block in mapping.blocks):  # also the directions that decide with these blocks free
             _, free = self.released(evaluation, unknowns)
             more = deciding_directions(free, mapping.n_parameters)[:, mapping.n_parameters :]
             directions = np.concatenate([directions, more], axis=1)
@@ -287,7 +287,7 @@ class Objective:
         """
 
         def fresh(of: tuple[tuple[Observation, NDArray[np.float64]], float]) -> Observation:
-            """One observation with what belongs together chosen anew."""
+            """One observation with its closest points chosen anew."""
             (observation, motion), offset = of
             return observation.rematched(motion, offset) if isinstance(observation, Rematched) else observation
 
@@ -329,7 +329,7 @@ class Objective:
         return self.parameters.by_unknowns(np.eye(n + n_modes)[kept], unknowns)
 
     def _offsets(self, s: int, unknowns: NDArray[np.float64]) -> list[float]:
-        """The offset of each observation of a state, 0 of those that have none."""
+        """The offset of each observation of a state, 0 where it has none."""
         known = dict(zip(self.parameters.offset_names(s), self.parameters.offsets(unknowns, s).tolist(), strict=True))
         return [known.get(o.name, 0.0) for o in self.states[s].observations]
 
@@ -399,7 +399,7 @@ def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np
 
 
 def _robust_weights(observation: Observation, residuals: Residuals) -> NDArray[np.float64]:
-    """The weights (n,) of residuals, times what the loss leaves of each."""
+    """The weights (n,) of residuals, times the robust weights of the loss."""
     return np.asarray(residuals.weights * observation.weighting.loss.weight(residuals.values))
 
 

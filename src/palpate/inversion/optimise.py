@@ -15,11 +15,11 @@ from palpate.errors import SolverError
 from palpate.inversion.by_image import Images, solve_by_image
 from palpate.inversion.objective import Evaluation
 
-RADIUS = 2.0  # of the log-moduli, the largest of a step; a first one has half of it
-LEAST_DAMPING = 0.1  # of the diagonal: less is nearly the step that was refused
-BAD = 0.25  # share of the reduction that is promised, good from 1 - 0.25 on (Nocedal & Wright 2006, Algorithm 4.1)
-TRIALS = 12  # of a step
-SAME_MINIMUM = 0.02  # of ln E: minima no further apart are one
+RADIUS = 2.0  # largest trust radius of the log-moduli; the first one is half of it
+LEAST_DAMPING = 0.1  # of the diagonal: with less the step is nearly the refused one
+BAD = 0.25  # of the promised reduction: below, the radius shrinks; above 1 - 0.25 it grows (Nocedal & Wright, Alg. 4.1)
+TRIALS = 12  # trials of a step before it fails
+SAME_MINIMUM = 0.02  # of ln E: minima that are nearer to each other count as one
 
 
 class LeastSquares(Protocol):
@@ -217,10 +217,10 @@ def _search(
     bounds: Bounds,
     region: TrustRegion,
 ) -> tuple[tuple[NDArray[np.float64], Evaluation, TrustRegion] | None, int, bool]:
-    """First step that reduces the objective, with the next region, or None; evaluations; whether any was solved.
+    """First step that reduces the objective, with the next region, or None; evaluations; whether any trial was solved.
 
-    A step d that brings too little, for the objective bends more along it than its matrix says, ends where the slopes
-    s.d at its ends have their secant's root, if that is lower.
+    Where the objective bends more along a step d than its matrix says, the step brings too little. It then ends at the
+    secant's root of the slopes s.d at its ends, if the objective is lower there.
     """
     n, solved, spent = objective.n_parameters, False, 0
     for _ in range(TRIALS):
@@ -234,7 +234,7 @@ def _search(
         spent += 1
         try:
             there = objective(trial)
-        except SolverError:  # no law answers where elements are turned inside out
+        except SolverError:  # elements would turn inside out
             region = region.smaller(longest)
             continue
         solved, gain, rises = True, now.value - there.value, float(there.score @ step)
@@ -244,7 +244,7 @@ def _search(
                 between = objective(nearer)
                 if between.value < min(now.value, there.value):
                     return (nearer, between, region), spent, True
-        if promised > 0.0 and gain > 1e-4 * promised:  # what a bound leaves of a step may lead uphill
+        if promised > 0.0 and gain > 1e-4 * promised:  # a step that a bound cuts may lead uphill
             return (trial, there, region.after(float(gain / promised), longest)), spent, True
         region = region.smaller(longest)
     return None, spent, solved
@@ -306,7 +306,7 @@ class _QuadraticModel:
 def _solve(matrix: NDArray[np.float64], rhs: NDArray[np.float64], images: Images = ()) -> NDArray[np.float64]:
     """Solve a positive semi-definite system (n, n) scaled to a unit diagonal for rhs (n, k), image by image.
 
-    A trace of ridge stands against rank loss.
+    A ridge of 1e-12 prevents a singular matrix.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))[:, None]
     scaled = scale * matrix * scale.T

@@ -29,8 +29,8 @@ from palpate.mechanics.reduced import free_combinations
 from palpate.progress import Progress
 from palpate.unknowns.blocks import Acts, Block
 
-COMPARED = replace(NEAR, correlate=False)  # the numbers of independent residuals stay: objectives are compared
-FOLLOWED = 2  # minima of starts beside the first one, the best
+COMPARED = replace(NEAR, correlate=False)  # numbers of independent residuals stay, so that objectives can be compared
+FOLLOWED = 2  # best minima of starts that are followed beside the first minimum
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
     evaluation = replace(objective, states=tuple(states))(fitted.unknowns)
     data, columns = evaluation.matrix - evaluation.prior, [parameters.columns(i) for i in range(len(parameters.blocks))]
     middle, evaluations = fitted.unknowns, fitted.evaluations + 1
-    # with them go the derivatives of all that is seen by all unknowns, which are large
+    # free the large derivatives of everything observed by all unknowns
     del objective, states, state, fitted, evaluation
     bases = [
         informed_combinations(b, data[np.ix_(own, own)]) for b, own in zip(parameters.blocks, columns, strict=True)
@@ -172,14 +172,14 @@ class _Responses:
     material: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32))
 
     def with_material(self, coefficients: NDArray[np.float64]) -> _Responses:
-        """With those to the material modes at coefficients (n_modes,) of homogeneous tissues."""
+        """The same with responses to the material modes, at coefficients (n_modes,) of homogeneous tissues."""
         q = coefficients[: self.boundary.shape[1]].astype(np.float32)
         values = np.asarray(self.boundary @ q + self.alone, dtype=np.float64)
         material = self.system.material_responses(values, tolerance=SNAPSHOT, dtype=np.float32)
         return replace(self, material=material)
 
     def seen(self, state: LaterState, coefficients: NDArray[np.float64]) -> FirstOrderModel:
-        """What is observed of them, to first order around coefficients (n_modes,); moduli move nothing."""
+        """The observed part of the responses, to first order around coefficients (n_modes,), at fixed moduli."""
         model, moduli = self.system.model, self.system.moduli
         by_boundary = state.seen(self.boundary).astype(np.float64)
         alone = state.seen(self.alone).astype(np.float64)

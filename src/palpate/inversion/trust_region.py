@@ -36,10 +36,10 @@ from palpate.observation.contract import seen_by
 from palpate.parallel import both
 from palpate.progress import silent
 
-NOISE = 0.5  # of the objective: that of closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
-INNER = 1e-4  # of the objective: decrement of a minimum on linear residuals, and change by hyper-parameters, that end
-SETTLES = 6  # times that numbers of independent residuals are taken anew, after which they stay
-TRIED = 4  # iterations under alternatives that were chosen afresh, after which J must be less than before
+NOISE = 0.5  # error of the objective from closest points that slide over voxels (Sun & Nocedal 2023, Math. Program.)
+INNER = 1e-4  # fall of the objective, by unknowns or hyper-parameters, at which a minimum on linear residuals ends
+SETTLES = 6  # how often the numbers of independent residuals are taken anew before they stay
+TRIED = 4  # iterations after blocks have chosen anew, within which J must fall below its earlier minimum
 
 
 class Criterion(StrEnum):
@@ -168,10 +168,10 @@ def predicted(before: OuterIterate, bounds: Bounds) -> OuterIterate:
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """A minimum on linear residuals: unknowns, the hyper-parameters there, J at both ends; cut: by the trust region.
+    """A step to a minimum on linear residuals: unknowns, hyper-parameters there, and J at both ends.
 
-    begin: the evaluation where it begins, under these hyper-parameters; settled: whether what is left of the residuals
-    there is no motion, so that it tells how many of them are independent.
+    begin: the evaluation at its start, under these hyper-parameters; cut: whether the trust region ended it; settled:
+    whether it is so short that its residuals show no motion any more, and so tell how many of them are independent.
     """
 
     objective: Objective
@@ -187,11 +187,11 @@ class _Step:
         return self.then + there.value - self.minimum.evaluation.value
 
     def reductions(self, unknowns: NDArray[np.float64], there: Evaluation) -> tuple[float, float]:
-        """By how much J falls on a way from unknowns (n,) to where it is evaluated, and on linear residuals.
+        """By how much J falls on a way d from unknowns (n,): at the evaluated end, and on linear residuals.
 
-        By the scores at both ends, -1/2 (s + s')^T d: closest points that slide over voxels are noise of J, as large as
-        what moduli promise, that the score, by the Jacobians of smooth surfaces, does not have. Or by J itself, where
-        that falls by more: on a long way the score does not change evenly.
+        The scores s, s' at both ends give -1/2 (s + s')^T d. Closest points that slide over voxels add noise to J, as
+        large as the expected fall. The scores, by the Jacobians of smooth surfaces, do not have it. Where J itself
+        falls by more, that counts, because on a long way the score does not change evenly.
         """
         d = self.minimum.unknowns - unknowns
         ends = there.score, self.minimum.evaluation.score
@@ -201,11 +201,11 @@ class _Step:
     def remaining(
         self, unknowns: NDArray[np.float64], there: Evaluation, bounds: Bounds
     ) -> tuple[list[NDArray[np.float64]], bool]:
-        """Steps (n,) by which a minimum may be missed after one from unknowns (n,); whether they are across that one.
+        """Steps (n,) that may still be missing after one from unknowns (n,); whether they are across that one.
 
-        First the step itself; of one that the trust region cut also what is left at its end, -H^-1 s over all that is
-        free. Where J is no lower and the score still leads on by more than half of the step, it is what is left across
-        it: errors of the normals pull a wall along itself, always alike, and no residual changes as they promise.
+        They are the step itself and, where the trust region cut it, the step -H^-1 s that is left at its end. Suppose
+        that J is no lower and the score still leads on by more than half of the step. Then only the part across the
+        step counts: errors of the normals pull a wall along itself everywhere alike, and no residual falls by it.
         """
         end, n = self.minimum.unknowns, self.objective.n_parameters
         taken, onward = end - unknowns, newton_step(there, bounds.free(end, there.score), n)
@@ -264,11 +264,12 @@ def fit_coefficients(objective: Objective, begin: NDArray[np.float64]) -> Minimu
 def _iteration(
     now: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion, *, grows: bool
 ) -> tuple[OuterIterate, TrustRegion]:
-    """One accepted step, or `STUCK` where none of some trials is; the region for the next, and whether it may grow.
+    """One accepted step, or `STUCK` where no trial is accepted; and the trust region for the next one.
 
-    A step that brings other alternatives is taken only where J does not rise by more than what is as good: else the
-    linear residuals promised of them what does not hold where they lead, and it is taken again without. So is one with
-    the first choice that gains too little; before that choice priors are not those of J, which may rise by it.
+    A step with other alternatives is taken only where J rises by no more than `AS_GOOD`. Else the linear residuals
+    promised what does not hold at its end, and the step is taken again without them. So is a step with the first choice
+    that gains too little. By a first choice J may rise, because its priors were others before. grows: whether the
+    region may grow.
     """
     n, before = now.objective.n_parameters, now.minimum
     moduli = np.append(np.arange(n), now.objective.parameters.acting_on_moduli)
@@ -304,9 +305,9 @@ def _iteration(
 
 
 def _chosen_afresh(now: OuterIterate) -> OuterIterate:
-    """With the blocks' alternatives as they are chosen where an iteration has ended, all blocks having their choice.
+    """The iterate after all blocks have chosen among their alternatives anew.
 
-    On the way an alternative stays until another one is more than as good, so that it hangs on where that began.
+    During the search an alternative stays until another one is clearly likelier, so that it depends on the start.
     """
     at, begin = now.minimum, replace(now.objective, learn_last=True, chosen=())
     learned = with_hyper_parameters(begin, at.evaluation, at.unknowns)
@@ -317,7 +318,7 @@ def _chosen_afresh(now: OuterIterate) -> OuterIterate:
 
 
 def _likeliest(ends: Sequence[OuterIterate], last: OuterIterate) -> OuterIterate:
-    """Of minima under other alternatives that with the least J; the cost is that of all, up to the `last` iteration."""
+    """The minimum with the least J among those under several alternatives; its cost is that of all iterations."""
     fewest = with_fewest(ends)
     best = min(ends, key=lambda end: total_counted_as(end, fewest))
     if best.minimum.evaluations == last.minimum.evaluations:
@@ -342,18 +343,18 @@ def with_fewest(iterates: Sequence[OuterIterate]) -> OuterIterate:
 
 
 def _numbers(objective: Objective) -> tuple[int | None, ...]:
-    """Those of the alternatives chosen for the blocks, None where a block has none, or no choice yet."""
+    """Numbers of the alternatives that blocks have chosen; None for a block without alternatives or choice."""
     return objective.chosen or (None,) * len(objective.parameters.blocks)
 
 
 def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region: TrustRegion) -> _Step:
-    """Unknowns and hyper-parameters with the least objective on residuals linear around a minimum so far.
+    """Unknowns and hyper-parameters with the least objective on residuals linear around the present minimum.
 
-    In turn, each of which lowers it: unknowns under given hyper-parameters, and these (see `with_hyper_parameters`).
-    Where the step is damped hyper-parameters stay. The numbers of independent residuals are taken anew before blocks
-    have their first alternative, for smooth noise has far fewer than voxels' rounding, and by too many a frame or a
-    wall that follows it seems certain; and from then on some times, where neither the trust region ends the step nor
-    it is longer than a standard deviation of some log-modulus, for what is still motion is alike over whole surfaces.
+    Unknowns and hyper-parameters (see `with_hyper_parameters`) are minimised in turn, each of which lowers J. Where the
+    step is damped the hyper-parameters stay. The numbers of independent residuals are first taken before blocks have
+    their first alternative: with too many, a frame or a wall that follows smooth noise seems certain. They are taken
+    anew `SETTLES` times, after steps that the trust region did not cut and that are shorter than a standard deviation
+    of each log-modulus. Residuals after longer steps contain motion, which is alike over whole surfaces.
     """
     objective, at, n = start.objective, start.minimum, start.objective.n_parameters
     trusted = [state.approximation.trust_radius for state in objective.states if state.approximation]
@@ -362,7 +363,7 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
     damping, within = region.damping, 0.05 * rule.tolerance(at, n)
 
     def least(linear: LinearisedObjective, begin: NDArray[np.float64]) -> tuple[Minimum, bool]:
-        """Its minimum, or how far on the way there what else acts on moduli may go; whether that is it."""
+        """The minimum, or the point towards it up to which layers' moduli may go; whether it was shortened so."""
         found = gauss_newton(linear, begin, bounds=near, tolerance=INNER, within=within)
         whole = found.unknowns - at.unknowns
         furthest = float(np.max(np.abs(whole[objective.parameters.acting_on_moduli]), initial=0.0))
@@ -402,10 +403,10 @@ def _linear_minimum(start: OuterIterate, bounds: Bounds, rule: StopRule, region:
 
 
 def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule) -> tuple[OuterIterate, int]:
-    """The objective at the end of a step, its model made exact there where its error matters; the evaluations spent.
+    """The objective at the end of a step, with the model made exact there where its error matters; the evaluations.
 
-    Where derivatives that decide are of too far away it is made exact in any case: after a step shorter than a standard
-    deviation at once, along what decides by the linear residuals.
+    Where derivatives that decide the moduli come from too far away, the model is made exact in any case. After a step
+    shorter than a standard deviation this is done at once, along the directions that decide on linear residuals.
     """
     n, before, unknowns = step.objective.n_parameters, now.minimum, step.minimum.unknowns
     objective, minimum = step.objective.rematched(unknowns), replace(step.minimum, outcome=Outcome.STEPS)

@@ -16,7 +16,7 @@ from palpate.mesh.space import Constraint, LagrangeSpace
 from palpate.mesh.surface import cut_faces, triangle_normals
 
 OUTER_KINDS = ("moving", "fixed", "sliding", "free")
-SAME_PLANE = 0.07  # share of the normals' second moment: faces at less than 30 deg are of one smooth surface
+SAME_PLANE = 0.07  # of the normals' second moment: faces at less than 30 degrees form one smooth surface
 
 
 def outer_constraint(

@@ -15,7 +15,7 @@ from enum import StrEnum
 
 from palpate.errors import ConfigurationError
 
-BLEND = 3.0  # c: where lambda = c mu (nu = 0.375) half of it acts at the points; docs/mechanics.md has the trials
+BLEND = 3.0  # c: for lambda = c mu (nu = 0.375) half of lambda acts at the points; see docs/mechanics.md
 
 
 class Dilatation(StrEnum):

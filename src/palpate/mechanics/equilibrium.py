@@ -15,7 +15,7 @@ from palpate.mechanics.newton import NewtonSettings
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mesh.space import Constraint, LagrangeSpace
 
-ACCURACY = 1e-7  # of the forces: the displacement's error is some nanometres
+ACCURACY = 1e-7  # relative residual of the forces, where the displacement's error is some nanometres
 
 
 def equilibrium(

@@ -33,11 +33,11 @@ from palpate.mesh.space import Constraint, LagrangeSpace
 
 Array = NDArray[np.float64]
 
-FACTORISATION_IN_SOLVES = 30  # right-hand sides that cost as much as a factorisation
-NEARLY_INCOMPRESSIBLE = 0.4999  # no coefficient leads Poisson's ratio beyond
-LACKING = 1e-2  # relative residual of a correction to derivatives of a like state
+FACTORISATION_IN_SOLVES = 30  # right-hand sides that take as long as a factorisation
+NEARLY_INCOMPRESSIBLE = 0.4999  # largest Poisson's ratio that a coefficient may lead to
+LACKING = 1e-2  # relative residual of a correction to the derivatives of a similar state
 ESTIMATED = 1e-4  # relative residual of a correction by another state's stiffness
-REFINEMENTS = 12  # solutions with an old factorisation that an exact one takes
+REFINEMENTS = 12  # solutions with an old factorisation that replace one with the exact factorisation
 
 
 @dataclass(frozen=True, slots=True)

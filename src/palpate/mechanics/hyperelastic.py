@@ -23,8 +23,8 @@ from palpate.parallel import mapped
 
 Array = NDArray[np.float64]
 
-CHUNK = 2048  # elements at once, where a few numbers are made of each
-STIFFNESS_CHUNK = 128  # where a stiffness is: what it takes stays in a core's cache, in half of the time
+CHUNK = 2048  # elements together, for a few numbers of each
+STIFFNESS_CHUNK = 128  # the same for stiffnesses, which then stay in the cache and take half of the time
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,8 +43,8 @@ from palpate.mesh.space import Constraint, LagrangeSpace
 from palpate.parallel import mapped
 
 LINEAR = Linear()
-OF_ERROR = 1e-4  # relative residual of the solution that an error is made of
-FURTHER = 10  # right-hand sides a modulus, beside one for each mode: sensitivities, series
+OF_ERROR = 1e-4  # relative residual of the solution from which an error is computed
+FURTHER = 10  # right-hand sides for each modulus beside those of the modes: sensitivities, series
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +120,7 @@ class LinearModel:
         """The factorised system at moduli (n_regions,) kPa, for any number of solves; raises `SolverError`."""
         checked = checked_moduli(moduli, self.names)
         near_nullspace = self.constraint.free.T @ rigid_modes(self.space.points)
-        # SciPy drops what cancels in a sum: with an imaginary part it stays, and one plan serves all moduli
+        # SciPy drops entries that cancel in a sum; an imaginary part keeps them, so that one pattern serves all moduli
         marked = (sparse.csr_matrix((k.data + 1j, k.indices, k.indptr), shape=k.shape) for k in self.free_stiffness)
         matrix = sparse.csr_matrix(weighted_sum(checked, tuple(marked)).real)
         return LinearSystem(
@@ -444,7 +444,7 @@ def weighted_sum(
 ) -> sparse.csr_matrix[np.float64]:
     """Sum over r of weights[r] (n_regions,) times matrices[r], (n, k) each, in the unit of their products."""
     smallest_first = sorted(zip(weights, matrices, strict=True), key=lambda term: term[1].nnz)
-    (weight, matrix), *others = smallest_first  # every sum is copied whole into the next
+    (weight, matrix), *others = smallest_first  # each addition would copy the whole sum
     total = weight * matrix
     for weight, matrix in others:
         total = total + weight * matrix

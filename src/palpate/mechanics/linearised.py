@@ -14,10 +14,10 @@ from palpate.errors import SolverError
 from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients, times
 from palpate.mechanics.solvers.contract import Factorisation
 
-TIGHT = 1e-12  # of the residual, relative
-ACCEPTED = 1e-9  # where rounding stops it
+TIGHT = 1e-12  # relative residual that is sought
+ACCEPTED = 1e-9  # relative residual that is accepted where rounding stops the iteration
 MAX_ITERATIONS = 100
-RESTARTS = 3  # from the true residual, which a factor in single precision leaves above the one that GMRES reckons with
+RESTARTS = 3  # from the true residual, which is larger than GMRES' own with a factor in single precision
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,8 @@ from palpate.mesh.gaussian_process import karhunen_loeve, matern
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.parallel import mapped, processors
 
-SHARE, SHARE_OF_MAP = 0.95, 0.9995  # of the variance of a tissue's ln E that its modes hold, and of one that is mapped
-MOST = 120  # modes of a tissue that is not mapped
+SHARE, SHARE_OF_MAP = 0.95, 0.9995  # share of the variance of ln E in the modes of a tissue, and of a mapped tissue
+MOST = 120  # largest number of modes of a tissue that is not mapped
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,11 +37,11 @@ from palpate.mechanics.solvers.contract import Factorisation
 
 Array = NDArray[np.float64]
 
-KEPT_VOLUME = 0.1  # of the smallest J before: no step of a line search goes below
-FORCING = (1e-3, 3e-2)  # least and largest relative residual to which conjugate gradients solve for a correction
-MAX_GRADIENTS = 18  # steps of them, after which a new factorisation is cheaper
+KEPT_VOLUME = 0.1  # of the smallest J (volume ratio) before a step, below which no step may lead
+FORCING = (1e-3, 3e-2)  # least and largest relative residual of a correction by conjugate gradients
+MAX_GRADIENTS = 18  # conjugate gradient steps, after which a new factorisation is cheaper
 SEARCHES = 8  # trials of a line search
-EASY = 4  # iterations; a step that needs no more is followed by one of twice its length
+EASY = 4  # iterations: after a step that needs no more, the next one is twice as long
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class NewtonPath:
 
 
 class _StepFailed(Exception):  # noqa: N818 - never leaves this module
-    """A step cannot be made; the text says why, `counts` what it cost."""
+    """A step failed; the text says why, and `counts` what it cost."""
 
     def __init__(self, reason: str, path: NewtonPath) -> None:
         super().__init__(reason)
@@ -107,7 +107,7 @@ class _StepFailed(Exception):  # noqa: N818 - never leaves this module
 
 @dataclass(frozen=True, slots=True)
 class _Way:
-    """The whole way: unit boundary increment (n_dof,) mm and the out-of-balance forces of the start (n_free,) mN."""
+    """The homotopy: the whole boundary increment (n_dof,) mm and the start's out-of-balance forces (n_free,) mN."""
 
     balance: TissueBalance
     settings: NewtonSettings
@@ -175,7 +175,7 @@ def _step(way: _Way, path: NewtonPath, length: float) -> NewtonPath:
         norm = float(np.linalg.norm(residual))
         if norm <= tolerance * path.force:
             return path
-        # As far as the next residual will be from zero anyway, and no further than the tolerance asks for.
+        # The correction is solved as exactly as the next residual deserves, and no more exactly than the tolerance.
         forcing = max(float(np.clip(norm / path.force, *FORCING)), 0.3 * tolerance * path.force / norm)
         if ahead < 1.0 or norm / before > tolerance * path.force / norm:  # a step would go on from pressures of before
             stiffness = balance.stiffness(path.displacement, path.pressure)
@@ -201,7 +201,7 @@ def _bearable(way: _Way, path: NewtonPath, change: Array) -> float:
 
 
 def _tolerance(way: _Way, fraction: float) -> float:
-    """The final tolerance at the end of the way, the one between steps before it."""
+    """The final tolerance at the end of the homotopy, and a looser one between its steps."""
     return way.settings.tolerance if fraction == 1.0 else way.settings.step_tolerance
 
 

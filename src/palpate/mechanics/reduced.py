@@ -21,8 +21,8 @@ from palpate.mechanics.solvers.conjugate_gradients import WORTH_THREADS, column_
 from palpate.parallel import mapped, processors
 
 RANK_TOLERANCE = 1e-10  # of the largest singular value of the normalised snapshots
-WELL_CONDITIONED = 1e-12  # of the Gram matrix' largest eigenvalue: above it Cholesky's factor orthogonalises safely
-ROWS = 2048  # of basis vectors that are met at once, in the cache
+WELL_CONDITIONED = 1e-12  # of the Gram matrix' largest eigenvalue; above it Cholesky's factor is safe
+ROWS = 2048  # of basis vectors that are processed together, in the cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ class ReducedModel:
         return np.asarray(np.sum(found, axis=0))
 
     def _by_rows(self, work: Callable[[slice], NDArray[np.float64]], n: int, numbers: int) -> list[NDArray[np.float64]]:
-        """What work makes of ranges of n rows, each by a thread where products with so many numbers are worth it."""
+        """Results of `work` for ranges of n rows, by threads where there are enough products."""
         if n * numbers < WORTH_THREADS:
             return [work(slice(0, n))]
         return mapped(
@@ -250,7 +250,7 @@ class Projection:
         if not fresh.shape[1]:
             return self
         fresh = orthonormal_basis(fresh, overwrite=True)
-        # once leaves the rounding of what it takes away
+        # a single pass leaves rounding errors of the subtracted part
         fresh = orthonormal_basis(fresh - self.spanned(self.components(fresh)), overwrite=True)
         model, old, blocks = self.model, self.reduced, []
         for matrix, block in zip(model.free_stiffness, old.stiffness, strict=True):

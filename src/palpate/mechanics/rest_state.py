@@ -14,8 +14,8 @@ from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.loads import DeadLoad, Load
 from palpate.mesh.space import Constraint
 
-TOLERANCE = 1e-8  # of the body's size, by which the loaded body may miss what was seen
-FORCES = 1e-10  # of the forces: to which each equilibrium is found on the way
+TOLERANCE = 1e-8  # of the body's size: largest distance of the loaded body from the observed one
+FORCES = 1e-10  # relative residual of each equilibrium on the way
 MOST = 60
 
 

@@ -13,7 +13,7 @@ from palpate.mesh.space import Constraint, LagrangeSpace
 
 AXES = ("x (right)", "y (anterior)", "z (superior)")
 NAMES = tuple(f"translation along {axis}" for axis in AXES) + tuple(f"rotation about {axis}" for axis in AXES)
-SUPPORTED = 1e-6  # of the motion, root mean square over the points: below, a motion moves no supported point
+SUPPORTED = 1e-6  # of the motion (root mean square), below which a motion counts as moving no supported point
 
 
 def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,10 +18,10 @@ from palpate.images.tissue import Role, Tissue
 from palpate.parallel import mapped
 
 ON_FACE_MM = 1e-4  # rounding in the coordinates of nodes on the faces of a box
-HELD_SMOOTHING = 2.0  # bones and air are not observed to hundredths of a millimetre; their roughness costs elements
-MOST_SHIFT = 0.5  # of the smoothing width
-HALVINGS = 16  # of the interval in which the shift is sought
-CROP_MM = 24.0  # a map is kept so far around its tissue; beyond, only "far away" matters to the mesh
+HELD_SMOOTHING = 2.0  # factor for bones and air, whose surfaces are no data and whose roughness would cost elements
+MOST_SHIFT = 0.5  # largest shift of a level, in smoothing widths
+HALVINGS = 16  # bisections of the interval in which the shift is sought
+CROP_MM = 24.0  # margin of a distance map around its tissue; the mesh needs no exact distances beyond
 
 
 class LevelSet(Protocol):

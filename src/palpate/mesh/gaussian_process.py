@@ -10,7 +10,7 @@ from scipy import linalg
 
 RANK_TOLERANCE = 1e-12
 Kernel = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-RANK = 400  # of a factor whose leading modes are sought, at the least
+RANK = 400  # least number of columns of a factor whose leading modes are sought
 
 
 def gaussian(squares: NDArray[np.float64]) -> NDArray[np.float64]:

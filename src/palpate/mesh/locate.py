@@ -14,11 +14,11 @@ from palpate.mesh.space import LagrangeSpace, shape_functions
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.parallel import mapped
 
-CANDIDATES = (8, 48, 240)  # tetrahedra that are tried, the ones with the nearest centroids first
+CANDIDATES = (8, 48, 240)  # tetrahedra that are tried, those with the nearest centroids first
 AT_ONCE = 200_000  # pairs of a point and a tetrahedron
 ON_A_FACE = 1e-9  # in barycentric coordinates
-ROUNDED = 1e-3  # of a tetrahedron's height: outside by so little is inside, as tables and meshes have few digits
-COLUMNS_AT_ONCE = 300_000  # columns of a tetrahedron that are tested at once by a thread, which bounds the memory
+ROUNDED = 1e-3  # of a tetrahedron's height: points that are outside by less count as inside, for tables have few digits
+COLUMNS_AT_ONCE = 300_000  # columns of voxels that a thread tests together, which limits the memory
 
 
 @dataclass(frozen=True, slots=True)

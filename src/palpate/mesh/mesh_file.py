@@ -27,8 +27,8 @@ READERS = {".msh": read_gmsh, ".inp": read_abaqus, ".med": read_med}
 READERS |= dict.fromkeys((".e", ".exo", ".ex2", ".exii", ".g", ".gen"), read_exodus)
 HOLLOW = ("vertex", "line", "tri", "quad", "polygon", "VTK_LAGRANGE_C", "VTK_LAGRANGE_TR", "VTK_LAGRANGE_Q")
 HEADING = 300  # bytes: the two lines with which .vtk begins, where 3D Slicer names the axes
-SLIVER = 1e-9  # volume over the cube of the longest edge
-JOINED = 1e-3  # of the shortest edge at a node: another one so near is meant to be the same
+SLIVER = 1e-9  # least volume over the cube of the longest edge
+JOINED = 1e-3  # of the shortest edge at a node: a nearer node is meant to be the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def read_mesh_file(path: Path, *, data: str | None = None) -> MeshFile:
 
 
 def _sound(read: Elements, digest: str) -> MeshFile:
-    """The mesh, its nodes numbered anew, with all that speaks of them; `InputDataError` for what is no sound one."""
+    """The mesh with its nodes, and all references to them, numbered anew; `InputDataError` for a mesh with faults."""
     count = sum((Counter({kind: len(rows)}) for kind, rows, _ in read.blocks), Counter[str]())
     (tets, groups), (triangles, shown), (points, sets) = (_once(read, corners) for corners in (4, 3, 1))
     if not len(tets):

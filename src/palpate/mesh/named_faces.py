@@ -12,7 +12,7 @@ from palpate.images.tissue import Role, Tissue
 
 WHOLE = "boundary"
 PLANES = tuple(f"{axis}_{end}" for axis in "xyz" for end in ("min", "max"))
-LEANS_DEG = 15.0  # of a surface against the plane that it is named by
+LEANS_DEG = 15.0  # largest angle between a named side's faces and its plane
 
 
 def plane_faces(

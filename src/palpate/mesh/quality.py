@@ -25,8 +25,8 @@ P5_DIHEDRAL_DEG = 25.0
 LEVEL_SET_TOLERANCE = 0.01
 VOXEL_TOLERANCE = 0.03
 COARSE_CELL_MM = 8.0
-LEAST_SLOPE = 0.25  # of a level set next to its surface, where two surfaces of an organ nearly meet
-HALVINGS = 4  # of the cells that a surface crosses
+LEAST_SLOPE = 0.25  # least slope of a level set at its surface, for places where two surfaces of an organ nearly meet
+HALVINGS = 4  # how often cells that a surface crosses are halved
 
 
 def in_words(point: NDArray[np.float64], grid: VoxelGrid | None) -> str:

@@ -19,8 +19,8 @@ from palpate.mesh.anatomy import Box
 from palpate.mesh.cutting import Grid
 from palpate.mesh.tet_mesh import FACES
 
-# Mmg makes room for millions of tetrahedra, and walks through all of it again and again, which takes half a second a
-# mesh. A small one gets less, and comes out the same: 17 000 tetrahedra are content with 40 MB.
+# Mmg allocates memory for millions of tetrahedra and visits all of it repeatedly, half a second for each mesh. Small
+# meshes get less memory, with the same result: 17 000 tetrahedra need 40 MB.
 SMALL_TETS = 20_000
 LEAST_MB, MB_A_TET = 64, 0.01
 HOLLOW_REFERENCE = 8  # references 1 to 6 are the faces of the box, 8 any hollow tissue, the rest pairs of regions
@@ -44,7 +44,7 @@ def interrupts_held() -> Iterator[None]:
         yield
     finally:
         for number, handler in handlers.items():
-            if handler is not None:  # None: not Python's, and not ours to put back
+            if handler is not None:  # None: no handler of Python, which cannot be restored here
                 signal.signal(number, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, earlier)
 

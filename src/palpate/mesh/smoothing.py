@@ -10,8 +10,8 @@ from palpate.mesh.cutting import Grid, signed_volumes, within_faces
 from palpate.mesh.snapping import Contacts
 from palpate.mesh.tet_mesh import tet_dihedrals
 
-SHARPNESS_DEG = 4.0  # in the penalty sum exp(-angle / sharpness): small, so that the worst angles dominate
-INVERTED_DEG = -60.0  # what an inverted tetrahedron's angles count as
+SHARPNESS_DEG = 4.0  # of the penalty sum exp(-angle / sharpness); small, so that the worst angles dominate
+INVERTED_DEG = -60.0  # angle that an inverted tetrahedron counts with
 TRIALS = 12
 
 
@@ -31,7 +31,7 @@ def smoothed(grid: Grid, contacts: Contacts, *, step_mm: float, sweeps: int, bel
     reach = np.full(len(nodes), step_mm)
     worst = tet_dihedrals(nodes[grid.tets]).min(axis=1)
     for _ in range(sweeps):
-        # of the nodes of bad tetrahedra those of the lowest priority around: no two in one tetrahedron
+        # nodes of bad tetrahedra with the lowest priority around, so that no two share a tetrahedron
         candidates = np.unique(grid.tets[worst < below_deg])
         priority = np.full(len(nodes), np.inf)
         priority[candidates] = rng.random(len(nodes))[candidates]

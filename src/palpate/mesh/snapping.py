@@ -12,7 +12,7 @@ from palpate.mesh.cutting import Grid, signed_volumes, within_faces
 from palpate.mesh.tet_mesh import FACES
 
 GRAZING = 0.25  # two surfaces that meet at a smaller (relative) angle count as one where they meet
-SHRINK_LIMIT = 0.25  # a move that leaves less of a tetrahedron's volume is cut back
+SHRINK_LIMIT = 0.25  # share of a tetrahedron's volume; a move that leaves less is shortened
 MAX_HALVINGS = 6
 # Strang and Fix: six points, exact to degree four, on the reference triangle
 QUADRATURE = np.array([[0.108103018168070, 0.445948490915965, 0.445948490915965],
@@ -170,7 +170,7 @@ def debiased(grid: Grid, contacts: Contacts) -> tuple[Grid, Contacts]:
 def _sides(grid: Grid, anatomy: Anatomy) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Faces (n, 3) between different tissues with the two (n, 2) tissues; -1 for a hollow one on the box's faces.
 
-    A hollow tissue is stood for by the first hollow one of the priority, or by the filler when there is no other.
+    The first hollow tissue by priority represents all hollow ones, or the filler where there is no other.
     """
     faces = grid.tets[:, FACES].reshape(-1, 3)
     region = np.repeat(grid.region, 4)

@@ -19,18 +19,18 @@ from palpate.mesh.snapping import contacts_of, debiased, snapped
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh, tet_dihedrals
 from palpate.progress import Progress, silent
 
-COARSEST = 4.0  # longest edge far from all surfaces, in the longest of organs
+COARSEST = 4.0  # longest edge far from all surfaces, over the longest edge at organs
 GRADING = 0.45  # growth of the edge length with the distance from a surface, mm per mm
 GRID_FACTOR = 1.5  # longest over mean edge of the grid's tetrahedra
-SAG = 0.15  # how far remeshing may move a surface, in longest edge lengths of organs; snapping puts it back
+SAG = 0.15  # how far remeshing may move a surface, over the longest edge at organs; snapping moves it back
 GAPS = (0.4, 0.75, 0.55)  # gaps and slivers thinner than 3/4 of this share of the edge length are closed
-GOOD_ENOUGH_DEG = 8.0  # no further attempt when the smallest dihedral angle is larger
+GOOD_ENOUGH_DEG = 8.0  # smallest dihedral angle with which no further attempt is made
 TOUCH = 0.25  # grid nodes so near to a surface, in edge lengths, are moved onto it
-CRUMB = 0.001  # a piece with a smaller share of the meshed volume that hangs on nothing is dropped
+CRUMB = 0.001  # share of the meshed volume; smaller pieces that touch no other are dropped
 SMOOTHING_SWEEPS = (20, 12)
 RESCUE_SWEEPS = 40
 RESCUE_DEG = 10.0
-COARSER = 1.5  # edge length on bones, air and known tissues, in the longest of organs
+COARSER = 1.5  # edge length on bones, air and known tissues, over the longest edge at organs
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ def tetrahedralise(
             f" domain, {anatomy.box.lengths.min():.1f} mm"
         )
     sizes = SizeField.of([anatomy.tissues[i] for i in anatomy.priority], edge_length_mm, longer_mm or {})
-    # the first without a bad angle, or the best: a gap as wide as the closing's reach closes in patches
+    # the first mesh without a bad angle, or the best one: a gap about as wide as the closing's reach closes in patches
     grid, best_angle = None, -np.inf
     failure = GeometryError("no attempt at meshing was made")
     for number, gap in enumerate(GAPS, start=1):
@@ -136,7 +136,7 @@ def _grid(anatomy: Anatomy, sizes: SizeField, progress: Progress) -> Grid:
     grid = _better(grid, anatomy, sizes, progress)
     try:
         return _better(grid, anatomy, sizes, progress)
-    except GeometryError:  # the second remeshing only saves tetrahedra; its input is a mesh already
+    except GeometryError:  # the second remeshing only saves tetrahedra; the mesh exists already
         return grid
 
 

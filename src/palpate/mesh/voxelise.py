@@ -17,15 +17,15 @@ from palpate.mesh.space import LagrangeSpace, shape_functions
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import OUTER, TetMesh
 
-TIES = 4  # voxels at the most whose column meets an edge that two faces round differently; a neighbour decides
+TIES = 4  # largest number of voxels that two faces at an edge round differently; a neighbour decides these
 
 
 Warp = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 LATTICE = 2.0**16  # corners are rounded to voxel / LATTICE: products of their differences are then exact in float64
-TIE = 2.0**-14  # voxels: a face at a voxel's centre counts as just below it, whatever the rounding
-BRICK = 4  # voxels along each edge of what is decided at once
-BASE = 4  # region r is the digit r in base BASE: sums of crossings that do not belong together cannot pass for a region
+TIE = 2.0**-14  # voxels: a face that is so near to a voxel's centre counts as just below it
+BRICK = 4  # voxels along each edge of a brick that is decided at once
+BASE = 4  # region r is the digit r in this base, so that sums of unrelated crossings match no region
 
 
 def voxelise(
@@ -78,8 +78,8 @@ def _behind(
 ) -> NDArray[np.int64]:
     """Of each voxel (m, 3) the region of the nearest face; the faces' `centres` (n, 3) mm and `regions` (n,).
 
-    Bricks of voxels ask first: where a region is nearer to the brick's middle than every other one by more than the
-    brick's diameter, it is so for all of its voxels.
+    Bricks of voxels are decided first. A region that is nearer to the brick's middle than all others, by more than the
+    brick's diameter, is nearest for all of its voxels.
     """
     shape = tuple(-(-n // BRICK) for n in grid.shape)
     brick = np.ravel_multi_index((voxels // BRICK).T, shape)

@@ -15,8 +15,8 @@ from palpate.observation.contract import DataFile
 from palpate.observation.field_file import read_field
 from palpate.observation.measured_points import MeasuredPoints, PointTable, checked_table, read_point_table
 
-FEWEST = 4  # points that tell a motion which is not the same everywhere
-COARSER = 2  # times the edge of a cell is doubled, at the most
+FEWEST = 4  # points that are needed to measure a motion that varies in space
+COARSER = 2  # how often the edge of a cell is doubled at the most
 OF_LENGTH, OF_EDGE = 0.5, 0.6  # edge of a cell, over the correlation length and over an edge of the mesh
 
 

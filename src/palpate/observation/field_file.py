@@ -23,8 +23,8 @@ from palpate.images.readers.text_header import StoredArray
 from palpate.observation.measured_points import read_text
 
 Field = tuple[NDArray[np.float64], VoxelGrid, tuple[str, ...]]
-MOST_VECTORS = 8 * 2**30 // 144  # a vector has 144 bytes until it is a pair of points, all of them may have 8 GiB
-MOST_BYTES = 24 * MOST_VECTORS  # of a file of transforms, in most of which a vector has 24
+MOST_VECTORS = 8 * 2**30 // 144  # 8 GiB in all, for a vector takes 144 bytes while it is read
+MOST_BYTES = 24 * MOST_VECTORS  # of a file of transforms, where a vector mostly has 24 bytes
 SIGNS = {"RAS": np.ones(3), "LPS": LPS_TO_RAS}
 DISPVECT, VECTOR = 1006, 1007  # intents of NIfTI, which ITK has in RAS and LPS; Workbench writes the second in RAS, too
 NAMES = {"Mapping": True, "NREG_TRANS 0": True, "NREG_TRANS 1": False}  # of SPM and NiftyReg: whether of positions
@@ -54,7 +54,7 @@ def read_field(path: Path, axes: str) -> Field:
 
 
 def _signs(told: str, axes: str, path: Path) -> NDArray[np.float64]:
-    """What turns vectors to RAS, by the axes that the file tells ("": none) and those that the case states."""
+    """The signs that turn vectors to RAS, by the file's axes ("": none) and those that the case states."""
     if told and axes not in ("", told):
         raise InputDataError(
             f"the vectors of '{path}' are in {told}, as it says, not in {axes}, as the case states; take the key out"
@@ -77,7 +77,7 @@ def _nifti(path: Path, axes: str) -> Field:
     signs, positions = _nifti_kind(content.header, axes, path)
     n_x, n_y, n_z = content.values.shape[:3]
     grid = VoxelGrid((n_x, n_y, n_z), nifti_affine(content.header, path))
-    with np.errstate(all="ignore"):  # what is not finite is none
+    with np.errstate(all="ignore"):  # values that are not finite count as missing
         vectors = content.values.reshape(n_x, n_y, n_z, 3) * signs * nifti_millimetres(content.header, path)
     if positions:
         vectors[~vectors.any(axis=-1)] = np.nan
@@ -106,7 +106,7 @@ def _nifti_kind(header: Any, axes: str, path: Path) -> tuple[NDArray[np.float64]
 
 
 def _nrrd(path: Path, axes: str) -> Field:
-    """Vectors in the measurement frame; where there is none, as ITK has them in LPS: the format leaves them open."""
+    """Vectors in the measurement frame; without one in LPS as in ITK, because the format does not say."""
     array, header = nrrd_content(path)
     space, unit = str(header["space"]).lower(), MILLIMETRES[header.get("space units", ["mm"])[0]]
     if space not in RAS_SIGNS:
@@ -139,8 +139,8 @@ def _field(array: StoredArray, turn: NDArray[np.float64], path: Path) -> Field:
 def _transform(path: Path, axes: str) -> Field:
     """The displacement of a transform on the finest grid of the fields that it holds.
 
-    Others are maps without a grid, which a field must have. No number stands where a point's way leaves the grid of a
-    field: beyond it ITK takes its displacement for none.
+    Transforms without such a field are refused, because a field needs a grid. Where a point leaves the grid of a field
+    the displacement is NaN: ITK would take it for zero there.
     """
     sitk, xfm = import_module("SimpleITK"), path.name.lower().endswith(".xfm")
     signs = _signs("" if xfm else "LPS", axes, path)  # SimpleITK takes the numbers of MNI tools for LPS, too
@@ -186,7 +186,7 @@ def _of_file(path: Path) -> tuple[list[Any], list[str]]:
 def _of_xfm(path: Path) -> tuple[list[Any], list[str]]:
     """The transforms of an MNI file in reverse, as it applies its first one first; grids are digested, too.
 
-    SimpleITK gives one of several: it gets each in a file of its own.
+    SimpleITK reads only one of several transforms, so each is passed to it in a file of its own.
     """
     sitk, (text, digest) = import_module("SimpleITK"), read_text(path)
     parts, digests = list[Any](), [digest]

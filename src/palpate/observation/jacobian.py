@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 ROWS = 8192  # residuals whose rows are formed at once: some 30 MB
-MANY = 4  # residuals a displacement, from which on the products of the sparse factor cost less than J itself
+MANY = 4  # residuals for each displacement, above which products with the sparse factor cost less than J itself
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,10 @@ from scipy.spatial import cKDTree
 from palpate.errors import InputDataError
 from palpate.observation.measured_points import MeasuredPoints
 
-NEAREST = 100  # measured points that tell the motion of one place
-FEWEST = 4  # that tell how a surface moves, turns and stretches
-FLAT = 1e-6  # of the points' extent: they tell nothing of how the motion changes across so little
-EXACT = 1e-4  # of the motion's standard deviation: errors that are taken for no smaller
+NEAREST = 100  # nearest measured points from which the motion of one place is computed
+FEWEST = 4  # points that are needed to know how a surface moves, turns and stretches
+FLAT = 1e-6  # of the points' extent: across a thinner direction the motion's change is unknown
+EXACT = 1e-4  # of the motion's standard deviation, the least error that is assumed
 
 
 @dataclass(frozen=True, slots=True)

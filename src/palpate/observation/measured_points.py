@@ -28,14 +28,14 @@ from palpate.observation.point_displacement import PointDisplacement, point_disp
 MOST_BYTES = 64 * 2**20
 COLUMNS = tuple(f"{when}_{axis}" for when in ("before", "after") for axis in "xyz")
 FARTHEST = 1e9  # mm
-SLIP = 0.5  # share of the points inside the mesh, from which on a slip explains them
-MOST_POINTS = 20_000  # whose direction, or place, is looked at
-TELLING = 20  # points whose tissue tells where they went
-SEVERAL = 8  # points that tell how displacements change
-STRETCH = 0.5  # mm a mm, in every direction: more than any body's
+SLIP = 0.5  # share of the points by which another reading must place more of them inside the mesh to be proposed
+MOST_POINTS = 20_000  # points whose direction or place is checked
+TELLING = 20  # least number of points at whose place the later image shows another tissue
+SEVERAL = 8  # least number of points that show how displacements change in space
+STRETCH = 0.5  # mm per mm in every direction, more than in any body
 FLAT = 1e-6  # of the points' extent
-NEAR = 0.1  # of the body's farthest place from the origin: in a smaller unit any points shrink onto the origin
-CLEARLY = 0.4  # share of these by which another reading must agree better
+NEAR = 0.1  # of the body's largest distance from the origin: a reading with all points nearer to it is no evidence
+CLEARLY = 0.4  # share of the points by which another reading must agree better
 PLACES = {  # of points that were written otherwise, by what turns them
     "x and y had the other sign: LPS read as RAS": LPS_TO_RAS,
     "they were written in metres": np.full(3, 1e3),

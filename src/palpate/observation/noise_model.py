@@ -17,19 +17,19 @@ from palpate.observation.jacobian import Jacobian
 from palpate.parallel import mapped
 
 LENGTHS = (0.5, 0.8, 1.2, 2.0, 3.0, 4.5, 6.5, 9.5, 14.0)  # mm
-CELL, FAR_CELL = 1.0, 3.0  # mm: residuals nearer than that are averaged before they are compared
-CELLS = 2**20  # along an axis, before they are counted from 0 again
-NEAR, REACH = 8, 28  # mm: from here on those of larger cells are compared, up to there any
-BINS = 1 + REACH  # of a cell with itself, then of 1 mm each
-FLOOR = 1e-3  # mm: no surface in an image is known better
-SMOOTH = 4.0  # mm: errors that are correlated over less are hardly taken for motion
-CUTOFF = 3.5  # correlation lengths, beyond which errors are taken for independent
-WITHIN = 0.75  # correlation lengths: errors so near are summed before a fit answers to them
-RESPONSE_CELLS = 800  # of a surface, on which what a fit leaves is seen
+CELL, FAR_CELL = 1.0, 3.0  # mm, edges of the cells over which residuals are averaged before pairs are compared
+CELLS = 2**20  # along an axis, after which cells are counted from 0 again
+NEAR, REACH = 8, 28  # mm: pairs beyond the first distance are of large cells, pairs beyond the second are left out
+BINS = 1 + REACH  # one for a cell with itself, then one for each mm
+FLOOR = 1e-3  # mm, the least standard deviation of a surface in an image
+SMOOTH = 4.0  # mm: the fit hardly mistakes errors with shorter correlation for motion
+CUTOFF = 3.5  # correlation lengths beyond which errors count as independent
+WITHIN = 0.75  # correlation lengths, edge of the cells in which errors are summed for the fit's response
+RESPONSE_CELLS = 800  # largest number of a surface's cells for which the fit's response is computed
 NEIGHBOURS = 12
-AT_ONCE = 256  # means whose neighbours' distances are taken at once: some 40 MB
-GROWTH = 1.15  # of the number of points from block to block
-LEAST = 1e-3  # variance of what the neighbours leave open, over its own
+AT_ONCE = 256  # means whose neighbours' distances are computed together: some 40 MB
+GROWTH = 1.15  # of the number of points from one block to the next
+LEAST = 1e-3  # least conditional variance given the neighbours, over the unconditional one
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,8 +203,8 @@ def _binned_products(
 ) -> NDArray[np.float64]:
     """Sums (4, n_bins) over pairs of cells, those of a cell with itself first: r_i r_j n_i.n_j, (n_i.n_j)^2, mm, 1.
 
-    A cell stands for the means of its residuals, places and normals: of 1 mm for pairs less than 8 mm apart; of 3 mm
-    for others, which so short a way makes no different, each as often as it has cells of 1 mm.
+    A cell holds the means of its residuals, places and normals. Pairs less than 8 mm apart are of cells of 1 mm. Others
+    are of cells of 3 mm, because 3 mm hardly change their distance; each counts as many times as it has cells of 1 mm.
     """
     cells = _cell_means(places, CELL)
     mean, centre, normal = _times(cells, values), _times(cells, places), _units(_times(cells, normals))
@@ -223,7 +223,7 @@ def _pair_sums(
     counts: NDArray[np.float64],
     between: tuple[int, int],
 ) -> NDArray[np.float64]:
-    """What `_binned_products` has of different cells so far apart (mm), each of which stands for `counts` (n_cells,).
+    """The part of `_binned_products` by pairs of cells at these distances (mm), each counted `counts` (n_cells,) times.
 
     values (n_cells,) mm, centres (n_cells, 3) mm, normals (n_cells, 3). A pair counts twice.
     """
@@ -252,8 +252,8 @@ def _cell_means(places: NDArray[np.float64], size: float) -> sparse.csr_matrix[n
 def _some_cell_means(places: NDArray[np.float64], most: int) -> sparse.csr_matrix[np.float64]:
     """Those of cells of 1 mm, but of so many of them at the most.
 
-    They are chosen by numbers that follow from their keys but without order (the finaliser of SplitMix64; Steele et
-    al. 2014): they stay chosen when others come and go, so that the fit does not jump as a surface moves.
+    A hash of their keys chooses them (the finaliser of SplitMix64; Steele et al. 2014). So a cell stays chosen when
+    others come and go, and the fit does not jump as a surface moves.
     """
     mixed = _cell_keys(places, CELL)[0].astype(np.uint64)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
@@ -265,7 +265,7 @@ def _some_cell_means(places: NDArray[np.float64], most: int) -> sparse.csr_matri
 def _times(
     cells: sparse.csr_matrix[np.float64] | sparse.coo_matrix[np.float64], values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """What a sparse matrix (m, n), of cells as a rule, makes of values (n,) or (n, k)."""
+    """Product of a sparse matrix (m, n), mostly of cells, with values (n,) or (n, k)."""
     return np.asarray(cells @ values, dtype=np.float64)
 
 
@@ -342,7 +342,7 @@ def whitener(groups: NDArray[np.float64], length: float) -> sparse.csr_matrix[np
     order = np.random.default_rng(0).permutation(n)
     rows, columns, values = list[NDArray[np.int64]](), list[NDArray[np.int64]](), list[NDArray[np.float64]]()
     start = 0
-    while start < n:  # all of a block are conditioned on what lies before the block
+    while start < n:  # all points of a block are conditioned on those before it
         end = min(int(GROWTH * start) + 1, n)
         block, k = order[start:end], min(NEIGHBOURS, start)
         near = np.zeros((len(block), 0), dtype=np.int64)

@@ -20,8 +20,8 @@ from palpate.mesh.tet_mesh import OUTER
 SUBTRIANGLES = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])  # of a quadratic triangle
 MIN_SHARE = 0.1
 NEEDED = (Role.ESTIMATE, Role.DRIVER)
-WIDTHS = 3.0  # of the Gaussian that makes surfaces: nearer to a cut they are those of what the image continues
-SAME_FIELD = 0.5  # voxels by which one image may reach beyond the other and still show the same
+WIDTHS = 3.0  # widths of the smoothing Gaussian: nearer to a cut, surfaces are continued, not seen
+SAME_FIELD = 0.5  # voxels by which fields of view may differ and still count as equal
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from palpate.observation.contract import DataFile, PointMotions, Residuals
 from palpate.observation.noise_model import whitener
 from palpate.observation.stated_noise import StatedNoise, stated_noise
 
-TOGETHER = 6  # points of one cell whose mean is compared, of errors that are alike
+TOGETHER = 6  # largest number of points in a cell's mean where their errors are correlated
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ def _means(
 ) -> tuple[sparse.csr_matrix[np.float64], sparse.csr_matrix[np.float64]]:
     """Means (n_cells, n) of points (n, 3) mm by the number (n,) of their cell, and what makes these independent.
 
-    Of errors that are alike over a length (mm) some points of each cell say nearly what all of them do.
+    Where errors are correlated over a length (mm), a few points of each cell tell nearly as much as all.
     """
     counts = np.bincount(number)
     if length <= 0.0:
@@ -98,7 +98,7 @@ def _means(
         return sparse.csr_matrix(shares, shape=(len(counts), len(points))), alone
     order, k = np.argsort(number, kind="stable"), min(TOGETHER, int(counts.max()))
     starts = np.cumsum(counts) - counts
-    spread = np.arange(k) / max(k - 1, 1)  # over the points of the cell in their order; with fewer some stand twice
+    spread = np.arange(k) / max(k - 1, 1)  # over the cell's points; with fewer, some are taken twice
     groups = order[starts[:, None] + np.rint(spread * (counts[:, None] - 1)).astype(np.int64)]
     entries = (np.full(groups.size, 1.0 / k), (np.repeat(np.arange(len(groups)), k), groups.ravel()))
     return sparse.csr_matrix(entries, shape=(len(groups), len(points))), whitener(points[groups], length)

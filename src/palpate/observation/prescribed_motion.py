@@ -16,7 +16,7 @@ from palpate.mesh.surface import cut_faces, tissue_surface, triangle_normals
 from palpate.observation.wall_modes import Wall, fine_modes, wall_modes, wall_of
 
 FRAME_LENGTHS = (0.7, 1.0)  # times the kernel of the frame's smooth motion
-FRAME_SHARE, FRAME_MODES = 0.99, 60  # of the frame's variance that its scalar modes hold; their largest number
+FRAME_SHARE, FRAME_MODES = 0.99, 60  # share of the frame's variance in its scalar modes; their largest number
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,10 +143,9 @@ def _frame_modes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[NDArray[np.float64], ...]]:
     """Smooth modes (3 n_points, k) mm, rigid ones (3 n_points, 6) mm and covariances (k, k) of the smooth ones.
 
-    What the smooth ones leave out is so short that it does not reach into the body (Saint-Venant). Rotations are about
-    the mean of the frame's points (n_points, 3) mm, to first order: images are aligned before. Covariances are those of
-    Gaussian processes with kernels of several lengths, seen through the modes: a kernel that is too long forbids
-    what a real border does.
+    Motion finer than the smooth modes does not reach into the body (Saint-Venant). Rotations are about the mean of the
+    frame's points (n_points, 3) mm, to first order, because images are aligned before. Covariances are those of
+    Gaussian processes with several kernel lengths, projected on the modes: too long a kernel excludes real motions.
     """
     if not len(points):
         return np.zeros((0, 0)), np.zeros((0, 0)), ()

@@ -13,8 +13,8 @@ from palpate.observation.noise_model import FitResponse, NoiseModel
 from palpate.observation.robust_loss import FAR, PowerLaw
 
 MAD = 1.4826  # standard deviations of a normal law in one median absolute deviation
-ALONE = 1e-3  # mm: length over which errors that are independent are alike
-FEW = 30  # residuals, of which a spread is not told
+ALONE = 1e-3  # mm, correlation length that stands for independent errors
+FEW = 30  # residuals, below which their spread is not reported
 
 
 def stated_noise(sd: float, n: int) -> tuple[NoiseModel, NoiseModel, Weighting]:

@@ -28,10 +28,10 @@ from palpate.observation.surface_residuals import Correspondence, correspondence
 from palpate.observation.target import SurfaceTarget, surface_target
 from palpate.parallel import mapped
 
-FLOOR = 1e-3  # mm: no surface in an image is known better
-LEAST_POINTS = 30  # of a surface that is neither an organ's nor a driver's, to be compared
+FLOOR = 1e-3  # mm, the least standard deviation of a surface in an image
+LEAST_POINTS = 30  # needed to compare a surface that is neither an organ's nor a driver's
 RIGID = 6.0  # freedoms of a rigid motion
-AROUND = 8.0  # widths of the Gaussian, within which the maps of an imaged model are asked
+AROUND = 8.0  # widths of the Gaussian around a surface within which an imaged model's maps are made
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +240,7 @@ class SurfaceDistance:
     def _count(self, noise: NoiseModel) -> float:
         """Number of independent residuals: the area that is compared by that over which errors are alike.
 
-        At least as many as a rigid motion has freedoms: what is alike over more of a surface is motion of it.
+        It is at least 6, the freedoms of a rigid motion: what is alike over more of a surface is its motion.
         """
         return max(float(self.held.of_model(self.target.area).sum()) / noise.correlation_area, RIGID)
 

@@ -15,7 +15,7 @@ from palpate.observation.observed_surface import FieldOfView, ObservedSurface
 # Strang & Fix 1973: three interior points, exact for quadratics; one point where triangles are as small as voxels
 THREE_POINTS = np.array([[4.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 4.0]]) / 6.0
 ONE_POINT = np.full((1, 3), 1.0 / 3.0)
-AREA_OF_A_POINT = 1.6  # mm^2: residuals nearer to each other than about a voxel say the same
+AREA_OF_A_POINT = 1.6  # mm^2 for each point: residuals within about a voxel carry the same information
 
 
 @dataclass(frozen=True, slots=True)

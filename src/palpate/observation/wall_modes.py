@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from palpate.mesh.gaussian_process import RANK_TOLERANCE, karhunen_loeve, kernel_factor
 
-DRIFT_LENGTHS = (1.0, 4.0)  # times the modes' own kernel, which they cannot go below
+DRIFT_LENGTHS = (1.0, 4.0)  # times the kernel of the modes, which sets the shortest length
 SWELLING_LENGTHS = (1.0, 2.0)
 FINE_KERNEL_MM, FINE_MM = 8.0, 0.3  # of what a wall does on a finer scale than its modes
 FINE_SHARE, FINE_MODES = 0.95, 150  # of its variance; number of modes at the most

@@ -1,4 +1,4 @@
-"""How walls move: fillings of hollow organs, smooth random motion as of another hand, affine motion."""
+"""How walls move: fillings of hollow organs, smooth random fields, affine motion."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.phantoms.shapes import Tube
 
-ENDS = 2.2  # half the organ's length in lengths of the filling: 9 % of it is left at the ends
-BLOCK = 2**17  # waves at points at a time: they fit into the cache
+ENDS = 2.2  # half the organ's length over the filling's length: the ends move by 9 % of the largest motion
+BLOCK = 2**17  # products of waves and points that are computed together: they fit into the cache
 
 
 class WallMotion(Protocol):
@@ -27,12 +27,12 @@ class WallMotion(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Filling:
-    """A tube that fills: motion away from its middle line, most at one place, as a smooth function of position.
+    """A tube that fills: its wall moves away from the middle line, most at one place, as a smooth function of position.
 
-    With s (mm) along the unit vector `axis` (3,) from `origin` (3,), and the spoke e = (x - m(s)) / radius_mm from the
-    parabola m(s) = origin + s axis + bend (s / length_mm)^2 (bend (3,) mm), its part along the axis left out:
-    u = A(s) (filling_mm (1 + lean e . towards) / (1 + lean) e + stray(x)),
-    A(s) = exp(-(s - fullest_mm)^2 / (2 length_mm^2)). towards (3,) unit vector.
+    s (mm) is the position along the unit vector `axis` (3,) from `origin` (3,) mm. The middle line is the parabola
+    m(s) = origin + s axis + bend (s / length_mm)^2, bend (3,) mm. e is (x - m(s)) / radius_mm without its part along
+    the axis. Then u = A(s) (filling_mm (1 + lean e . towards) / (1 + lean) e + stray(x)) with
+    A(s) = exp(-(s - fullest_mm)^2 / (2 length_mm^2)) and the unit vector towards (3,).
     """
 
     origin: NDArray[np.float64]
@@ -67,7 +67,7 @@ def filling_of(
     lean: float,
     stray: SmoothField,
 ) -> Filling:
-    """The filling of a tube: its middle line is the parabola through the tube's knots, in the least squares' sense.
+    """The filling of a tube, whose middle line is the least-squares parabola through the tube's knots.
 
     Lengths in mm; towards (3,) unit vector; see `Filling`.
     """
@@ -120,18 +120,18 @@ class AffineMotion:
 
 
 def _around(spokes: NDArray[np.float64], towards: NDArray[np.float64], lean: float) -> NDArray[np.float64]:
-    """Share (n, 1), dimensionless, of the motion along spokes (n, 3): 1 `towards` (3,), less on the other side."""
+    """Share (n, 1), dimensionless, of the motion along spokes (n, 3): 1 along `towards` (3,), less opposite to it."""
     return np.asarray((1.0 + lean * spokes @ towards[:, None]) / (1.0 + lean))
 
 
 def wall_filling(segmentation: Segmentation, tissue: int, *, filling_mm: float) -> Filling:
-    """The filling of a tissue of the segmentation, by its index, by `filling_mm` where the organs are nearest.
+    """The filling by `filling_mm` of the tissue with this index in the segmentation.
 
-    It is fullest half way from its middle to the tenth of its voxels that are nearest to the first `estimate` tissue's
-    centre (in its middle when there is none).
+    The motion is largest half way between the tissue's middle and the tenth of its voxels that are nearest to the
+    centre of the first `estimate` tissue. Without such a tissue it is largest in the middle.
 
-    Its middle line is the parabola through its voxels along their longest axis (least squares), its radius that of a
-    round tube with the same spread across, R^2 = 2 mean r^2. Raises `GeometryError` for a tissue of a few voxels.
+    The middle line is the least-squares parabola through the voxels along their longest axis. The radius R is that of
+    a round tube with the same spread across, R^2 = 2 mean r^2. Raises `GeometryError` for fewer than ten voxels.
     """
     voxels = segmentation.grid.world(np.argwhere(segmentation.mask(tissue)).astype(float))
     if len(voxels) < 10:
@@ -177,7 +177,7 @@ class SmoothField:
     sines: NDArray[np.float64]
 
     def at(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Field (n, 3) mm at points (n, 3) mm, to a millionth: phases in double, waves in single precision."""
+        """Field (n, 3) mm at points (n, 3) mm, exact to 1e-6: phases in double, waves in single precision."""
         turns, block = self.frequencies.T / (2.0 * np.pi), max(1, BLOCK // len(self.frequencies))
         cosines, sines = self.cosines.astype(np.float32), self.sines.astype(np.float32)
         found = np.empty((len(points), 3))

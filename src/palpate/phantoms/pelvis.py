@@ -18,18 +18,18 @@ from palpate.phantoms.scene import Noise, Scene, centred_grid, grid_box, make_sc
 from palpate.phantoms.shapes import rotation_about
 
 SURROUNDINGS_KPA = 10.0
-STRAY = 0.05  # non-radial motion of the rectum's wall, standard deviation a component in parts of the filling
+STRAY = 0.05  # standard deviation of each component of the rectum's random motion, over the filling
 STRAY_LENGTH_MM = 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class PelvisOptions:
-    """What a pelvis is to be; whatever is None is drawn with the seed.
+    """The options of a pelvis; whatever is None is drawn with the seed.
 
-    `filling_mm`: the rectum's wall moves so far where it moves most; `moduli_kpa` by tissue (default: prostate and
-    bladder 15 to 60 kPa, a tumour 2 to 3 times its gland; the surroundings have 10 kPa); `poisson_ratio` of all
-    tissues or by tissue (default 0.40 to 0.45 each); `bone_motion_mm` and as many degrees move each bone as a rigid
-    body; `law` and `law_parameters`: the tissues' (see `make_scene`); `motion_seed` draws another motion of the same
+    `filling_mm`: largest motion of the rectum's wall. `moduli_kpa` by tissue: by default 15 to 60 kPa for prostate and
+    bladder, 2 to 3 times the prostate's for a tumour, 10 kPa for the surroundings. `poisson_ratio` of all tissues or by
+    tissue: by default 0.40 to 0.45 each. `bone_motion_mm`: each bone moves as a rigid body by so many mm and degrees.
+    `law` and `law_parameters`: those of all tissues (see `make_scene`). `motion_seed` draws another motion of the same
     body.
     """
 
@@ -53,9 +53,9 @@ def pelvis(options: PelvisOptions) -> Scene:
     """The scene of `options`.
 
     Tissues: prostate and bladder (`estimate`), which touch; tumour (`estimate`) in the prostate; rectum (`driver`);
-    left and right bone (`rigid`); surroundings (`known`). The seed's shapes, moduli and motion are drawn apart, so
-    that tumour, noise or voxel size leave the rest of the body as it is. Raises `GeometryError` when the truth folds
-    over, `ConfigurationError` for a field that is too small or a modulus for an unknown tissue.
+    left and right bone (`rigid`); surroundings (`known`). Shapes, moduli and motion have random streams of their own.
+    So a tumour, noise or another voxel size does not change the rest of the body. Raises `GeometryError` when the
+    truth folds over, and `ConfigurationError` for a field that is too small or a modulus of an unknown tissue.
     """
     anatomy = pelvis_anatomy(options)
     return make_scene(
@@ -90,7 +90,7 @@ def pelvis_motions(options: PelvisOptions) -> dict[str, WallMotion]:
         )
     }
     for name, bone in zip(("left bone", "right bone"), body.bones, strict=True):
-        axis, direction = motion_rng.normal(size=(2, 3))  # of a turn about the bone's centre, and of a shift
+        axis, direction = motion_rng.normal(size=(2, 3))  # of the rotation about the bone's centre, and of its shift
         gradient = rotation_about(axis, options.bone_motion_mm) - np.eye(3)
         motion = AffineMotion(gradient, bone.centre, options.bone_motion_mm * direction / np.linalg.norm(direction))
         if options.bones and options.bone_motion_mm > 0.0:

@@ -1,4 +1,4 @@
-"""Random male pelves: a prostate pressed into the bladder above it, the rectum behind, bones beside."""
+"""Random male pelves: a prostate that touches the bladder above it, the rectum behind, bones at the sides."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from palpate.mesh.anatomy import Box
 from palpate.phantoms.shapes import Ellipsoid, Tube, Union, rotation_about
 
 DRAWS = 40
-MARGIN_MM, RECTUM_MARGIN_MM = 5.0, 13.0  # to the border of the image; the rectum is going to fill
-GAP_MM = 3.0  # of bones to anything else
+MARGIN_MM, RECTUM_MARGIN_MM = 5.0, 13.0  # to the border of the image; the rectum needs room to fill
+GAP_MM = 3.0  # between bones and organs, at least
 TURN_DEG = 18.0
-FORWARDS_MM = 4.0  # of the image's middle: leaves room behind the rectum
+FORWARDS_MM = 4.0  # from the image's middle to the body's, which leaves room behind the rectum
 
 
 @dataclass(frozen=True, slots=True)
 class PelvisShapes:
-    """Where the organs are; `forwards` (3,) unit vector from the rectum to the front of the body."""
+    """The organs' shapes and places; `forwards` (3,): unit vector from the rectum to the front of the body."""
 
     prostate: Ellipsoid
     bladder: Ellipsoid
@@ -31,10 +31,10 @@ class PelvisShapes:
 
 
 def draw_pelvis(rng: np.random.Generator, box: Box, *, bones: bool) -> PelvisShapes:
-    """A pelvis of random shape, position and orientation that fits into `box`; axes about right, front and up.
+    """A pelvis of random shape, position and orientation that fits into `box`; its axes are near right, front and up.
 
-    The same `rng` state gives the same body, whether its tumour or bones are going to be used or not, unless bones
-    do not fit. Raises `ConfigurationError` when the box is too small.
+    The same `rng` state gives the same body, with or without its tumour or bones, unless the bones do not fit. Raises
+    `ConfigurationError` when the box is too small.
     """
     for _ in range(DRAWS):
         body = _placed(_upright(rng), rng, box)
@@ -53,14 +53,14 @@ def draw_pelvis(rng: np.random.Generator, box: Box, *, bones: bool) -> PelvisSha
 
 
 def _upright(rng: np.random.Generator) -> PelvisShapes:
-    """A body in its own axes, the prostate's centre at the origin."""
+    """A body in its own axes, with the prostate's centre at the origin."""
     prostate = Ellipsoid(np.zeros(3), rng.uniform(17.0, 22.0, 3), _turn(rng, 15.0))
     up = rotation_about(np.array([1.0, 0.0, 0.0]), -rng.uniform(0.0, 12.0)) @ np.array([0.0, 0.0, 1.0])
     semi_axes = np.array([*rng.uniform(23.0, 29.0, 2), rng.uniform(21.0, 25.0)])
     turn = _turn(rng, 12.0)
     reach = _reach(prostate.semi_axes, prostate.rotation, up) + _reach(semi_axes, turn, up)
     bladder = Ellipsoid((reach - rng.uniform(3.5, 6.0)) * up, semi_axes, turn)
-    # a tube some 65 mm long behind the organs, brought to a gap of 8 to 10 mm from them
+    # a tube some 65 mm long behind the organs, moved until its gap to them is 8 to 10 mm
     height = np.linspace(-0.5, 0.5, 5)
     length = rng.uniform(40.0, 44.0)
     bend, lean, side = rng.uniform(2.0, 8.0), rng.uniform(-3.0, 3.0), rng.uniform(-3.0, 3.0)
@@ -75,7 +75,7 @@ def _upright(rng: np.random.Generator) -> PelvisShapes:
             break
         knots = knots + np.array([0.0, excess, 0.0])
     rectum = Tube(knots, radii)
-    # a tumour of at least 5 mL, off the prostate's centre, 2 mm or more (if there is room) under its surface
+    # a tumour of at least 5 mL, off the prostate's centre, and at least 2 mm below its surface where there is room
     semi_axes, turn = rng.uniform(10.7, 11.8, 3), _turn(rng, 90.0)
     away = 6.0 * _directions(1, rng)[0]
     for share in np.linspace(1.0, 0.0, 11):

@@ -27,7 +27,7 @@ from palpate.phantoms.motion import WallMotion, smooth_field
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Smooth noise of the imaged surfaces, drawn anew for each image: standard deviation a component and length, mm."""
+    """Smooth noise of the imaged surfaces, drawn for each image: standard deviation of a component and length, mm."""
 
     surface_sd_mm: float
     correlation_length_mm: float
@@ -35,9 +35,9 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class BoundaryMotion:
-    """How a body's boundary moves: `walls` by name of a hollow tissue, and the `border` of the body; None: it is held.
+    """How a body's boundary moves: `walls` by name of a hollow tissue, and the `border` of the body (None: held).
 
-    A hollow tissue that is not among the walls holds still.
+    A hollow tissue that has no entry in `walls` is held.
     """
 
     walls: Mapping[str, WallMotion] = field(default_factory=dict)
@@ -46,11 +46,11 @@ class BoundaryMotion:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A truth and its two images.
+    """A body with known moduli and its two images.
 
-    `space` (P2) with its mesh and `displacement` (n_points, 3) mm; the tissues' `youngs_modulus_kpa` are the truth.
+    `space` (P2) holds the mesh; its tissues' `youngs_modulus_kpa` are the truth. `displacement` (n_points, 3) mm.
     `before` and `after` show the rest state and the deformed state of that mesh, label = index of the tissue + 1.
-    `motions`: by name of a hollow tissue, how its wall moves; a hollow tissue that is not there holds still.
+    `motions`: how walls move, by name of the hollow tissue; a hollow tissue without an entry is held.
     """
 
     space: LagrangeSpace
@@ -86,11 +86,11 @@ def make_scene(
     seed: int,
     law: Law,
 ) -> Scene:
-    """Mesh the anatomy, move the walls of its hollow tissues (outer border held), image both states.
+    """Mesh the anatomy, move the walls of its hollow tissues with the outer border held, and image both states.
 
-    `law`: the tissues'; finite strain on elements that do not lock.
-    Every meshed tissue of the anatomy needs its `youngs_modulus_kpa`. `edge_length_mm` is the mesh's at the surfaces;
-    `seed` only draws the noise. Raises `GeometryError` where the truth folds over or cannot be meshed.
+    `law`: that of all tissues; at finite strain the elements do not lock. Every meshed tissue of the anatomy needs its
+    `youngs_modulus_kpa`. `edge_length_mm` is the mesh's at the surfaces. `seed` only draws the noise. Raises
+    `GeometryError` where the truth folds over or cannot be meshed.
     """
     space = lagrange_space(tetrahedralise(anatomy, edge_length_mm=edge_length_mm), "P2")
     displacement = displacements(space, [BoundaryMotion(motions)], law=law)[0]
@@ -100,10 +100,10 @@ def make_scene(
 
 
 def displacements(space: LagrangeSpace, motions: Sequence[BoundaryMotion], *, law: Law) -> list[NDArray[np.float64]]:
-    """Displacement (n_points, 3) mm of a body under each of some motions of its boundary, by tissues of one `law`.
+    """Displacement (n_points, 3) mm of a body under each of several motions of its boundary; all tissues have one law.
 
-    Every meshed tissue of the space needs its `youngs_modulus_kpa`; finite strain is on elements that do not lock; the
-    motions of the linear law share one factorisation.
+    Every meshed tissue of the space needs its `youngs_modulus_kpa`. At finite strain the elements do not lock. Under
+    the linear law all motions share one factorisation.
     """
     tissues = space.mesh.tissues
     hollow = [i for i, tissue in enumerate(tissues) if tissue.role in (Role.DRIVER, Role.RIGID)]
@@ -139,9 +139,9 @@ def refuse_folded(space: LagrangeSpace, displacement: NDArray[np.float64]) -> No
 def _prescribed(
     space: LagrangeSpace, motion: BoundaryMotion, hollow: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Displacement (n_dof,) mm that the boundary is given, and the points (n_points,) that are given one.
+    """Prescribed displacement (n_dof,) mm of the boundary, and which points (n_points,) have one.
 
-    Where the border meets a wall that moves, it moves with the wall.
+    Points that a moving wall shares with the border move with the wall.
     """
     offset = np.zeros_like(space.points)
     prescribed = np.zeros(len(space.points), dtype=np.bool_)
@@ -155,7 +155,7 @@ def _prescribed(
 
 
 def reimaged(scene: Scene, grid: VoxelGrid, *, noise: Noise | None) -> Scene:
-    """The same truth seen on another voxel grid, with other noise (drawn with the scene's seed) or none."""
+    """The same truth imaged on another voxel grid, with other noise (drawn with the scene's seed) or none."""
     before, after = _images(scene.space, scene.displacement, grid, noise, scene.seed)
     return replace(scene, before=before, after=after)
 
@@ -191,6 +191,6 @@ def centred_grid(field_mm: tuple[float, float, float], spacing_mm: tuple[float, 
 
 
 def grid_box(grid: VoxelGrid) -> Box:
-    """The box of all voxels of an upright grid, out to their outer faces."""
+    """The box that the voxels of a grid along the world's axes fill, up to their outer faces."""
     lengths = np.array(grid.shape) * grid.spacing
     return Box(grid.world(np.full((1, 3), -0.5))[0], np.eye(3), lengths)

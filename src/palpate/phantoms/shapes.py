@@ -1,4 +1,4 @@
-"""Bodies given by their signed distance: ellipsoids, balls, tubes, and what boolean operations make of them."""
+"""Bodies given by their signed distance: ellipsoids, balls, tubes, unions and complements."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
 NEWTON_STEPS = 40  # for the closest point of an ellipsoid; the iteration is monotone and rarely needs ten
-PLACES = 401  # along a tube, of which one is near every point's closest
+PLACES = 401  # along a tube's centre line, where the search for a closest point begins
 
 
 class Shape(Protocol):
@@ -61,7 +61,7 @@ class Ellipsoid:
         return np.asarray(np.where(outside, distance, -distance)), np.asarray(normal)
 
     def surface(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (n, 3) mm of the surface that belong to unit `directions` (n, 3)."""
+        """Points (n, 3) mm of the surface, the images of unit `directions` (n, 3) on the unit sphere."""
         return np.asarray(self.centre + (directions * self.semi_axes) @ self.rotation.T)
 
     def _closest(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -69,7 +69,7 @@ class Ellipsoid:
         axes = self.semi_axes[:, None]  # the points come last: sums over three axes run along them
         away = np.where(local.T < 0.0, -1.0, 1.0) * np.maximum(np.abs(local.T), 1e-7 * axes)  # off the symmetry planes
         stretched, squares = axes * away, axes**2
-        t = (np.abs(stretched) - squares).max(axis=0)  # left of the root of a convex, falling function
+        t = (np.abs(stretched) - squares).max(axis=0)  # below the root of a convex, decreasing function
         for _ in range(NEWTON_STEPS):
             below = t + squares
             terms = (stretched / below) ** 2
@@ -87,12 +87,11 @@ def ball(centre: NDArray[np.float64], radius: float) -> Ellipsoid:
 
 @dataclass(frozen=True, slots=True)
 class Tube:
-    """A tube with rounded ends about a curve through `knots` (n, 3) mm.
+    """A tube with rounded ends around a curve through `knots` (n, 3) mm, with `radii` (n,) mm there.
 
-    `radii` (n,) mm at the knots; both vary as cubic splines. The distance is |p - c| - r at the closest point c of the
-    centre line: exact for a constant radius, to first order for a slowly varying one. `curve` and `radius`: the
-    splines, from 0 to 1; of so many `places` (n_places,) the closest, found by the `tree`, is where Newton's method
-    begins.
+    Curve and radius are cubic splines, `curve` and `radius`, of a parameter from 0 to 1. The distance is |p - c| - r at
+    the closest point c of the centre line. It is exact for a constant radius, and to first order for a slowly varying
+    one. Newton's method for c begins at the nearest of the `places` (n_places,), which the `tree` finds.
     """
 
     knots: NDArray[np.float64]
@@ -140,7 +139,7 @@ class Tube:
     def _bend(
         self, place: NDArray[np.float64], spoke: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Slopes c' (n, 3) mm and |c'|^2 - (p - c) . c'' (n,) mm^2 at places (n,), at least a fifth of |c'|^2."""
+        """Slopes c' (n, 3) mm and |c'|^2 - (p - c) . c'' (n,) mm^2, at least |c'|^2 / 5, at places (n,)."""
         slope = self.curve(place, 1)
         square = np.einsum("ni,ni->n", slope, slope)
         bend = square - np.einsum("ni,ni->n", spoke, self.curve(place, 2))

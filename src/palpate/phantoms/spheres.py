@@ -1,4 +1,4 @@
-"""Balls in balls: small scenes with a known truth, for benchmarks and first steps."""
+"""Concentric balls: small scenes with a known truth, for benchmarks and first steps."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ STRAY = 0.05
 
 @dataclass(frozen=True, slots=True)
 class SpheresOptions:
-    """What the balls are to be.
+    """The options of the balls.
 
-    `kind`: "squeezed", a core (10 mm) in a shell (20 mm) in surroundings (30 mm) whose outside, the driver `frame`,
-    is squeezed by a random stretch; "tumour", the same with a tumour out of the organ's centre; "pushed", a hollow
-    core, the driver `cavity`, that grows in the shell, in a box of surroundings that is held. `push_mm`: the wall
-    moves so far where it moves most. `moduli_kpa` by tissue (default: core 60, shell or organ 30, tumour 75,
-    surroundings 10); `poisson_ratio` of all or by tissue (default 0.45); `law` and `law_parameters`: the tissues' (see
-    `make_scene`).
+    `kind` is one of three. "squeezed": a core (radius 10 mm) in a shell (20 mm) in surroundings (30 mm); the driver
+    `frame` around them is deformed by a random stretch. "tumour": the same with a tumour off the organ's centre.
+    "pushed": a hollow core, the driver `cavity`, grows in the shell, in a box of surroundings with held sides.
+    `push_mm`: the wall's largest motion. `moduli_kpa` by tissue (default: core 60, shell or organ 30, tumour 75,
+    surroundings 10). `poisson_ratio` of all or by tissue (default 0.45). `law` and `law_parameters`: those of all
+    tissues (see `make_scene`).
     """
 
     seed: int
@@ -49,7 +49,7 @@ class SpheresOptions:
 
 
 def spheres(options: SpheresOptions) -> Scene:
-    """The scene of `options`; the balls' common centre is a random part of a voxel off the grid.
+    """The scene of `options`; the balls' common centre lies at a random place within a voxel.
 
     Raises `ConfigurationError` for an unknown kind or tissue, `GeometryError` when the truth folds over.
     """
@@ -83,13 +83,13 @@ def _body(options: SpheresOptions) -> tuple[Anatomy, dict[str, WallMotion]]:
     centre = rng.uniform(-0.5, 0.5, 3) * grid.spacing
     parts: dict[str, LevelSet | None]
     motions: dict[str, WallMotion] = {}
-    if options.kind == "pushed":  # a cavity that grows, more to one side, in a ball in a box
+    if options.kind == "pushed":  # a cavity grows, more to one side, in a ball in a box
         parts = {"cavity": ball(centre, CORE), "shell": ball(centre, SHELL), "surroundings": None}
         towards = rng.normal(size=3)
         towards /= np.linalg.norm(towards)
         stray = smooth_field(rng, sd_mm=STRAY * options.push_mm, correlation_mm=CORE, features=300)
         motions["cavity"] = Swelling(centre, CORE, options.push_mm, towards, LEAN, stray)
-    else:  # balls in a frame that is stretched along one axis and squeezed along another, with a turn in it
+    else:  # a random affine motion without change of volume, to first order, deforms the frame around the balls
         inner, outer = ("tumour", "organ") if options.kind == "tumour" else ("core", "shell")
         away = rng.normal(size=3)
         off = 5.0 * away / np.linalg.norm(away) if options.kind == "tumour" else np.zeros(3)

@@ -63,7 +63,7 @@ def read_archive(kind: type[T], path: Path, *, version: str, sha256: str | None 
         return typing.cast("T", _decode(kind, plain["value"], arrays, finite or None))
     except MemoryError:
         raise
-    except Exception as error:  # whatever another's file makes of our reading: it is no data of ours
+    except Exception as error:  # any error of reading means that the file is not one of ours
         raise InputDataError(
             f"{path} does not hold the data of a run ({type(error).__name__}: {printable(str(error)[:200])}); run"
             " the estimate again"
@@ -95,7 +95,7 @@ def _encode(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
     """`value` in JSON's types; its arrays go to `arrays` under a number."""
     if isinstance(value, np.ndarray):
         for name, stored in arrays.items():
-            if stored is value:  # what stands in two places is kept once
+            if stored is value:  # an array in two places is kept once
                 return name
         name = f"a{len(arrays)}"
         arrays[name] = value

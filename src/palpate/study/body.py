@@ -123,13 +123,13 @@ def on_linear_elements(body: Body, case: Case) -> Body:
 
 
 def _remade(body: Body, case: Case, **changes: Any) -> Body:
-    """The body with these changes, on which what was measured is asked anew."""
+    """The body with these changes; measurements are attached to it anew."""
     found = replace(body, **changes)
     return replace(found, measured=_measured(found, case)[0])
 
 
 def _measured(body: Body, case: Case) -> tuple[tuple[tuple[int, Observation], ...], tuple[Finding, ...]]:
-    """The data terms beside the images, by the number of their state, and what is to be said of them."""
+    """The data terms beside the images, by the number of their state, and the findings on them."""
     mechanics, space = case.mechanics, body.space
 
     def reaction_of(name: str, direction: NDArray[np.float64]) -> SurfaceReaction:

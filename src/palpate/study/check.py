@@ -291,7 +291,7 @@ Pair = tuple[Segmentation, tuple[Segmentation, ...]]
 
 
 def _further_problems(problems: _Problems, case: Case, progress: Progress) -> tuple[ImagedStates, ...]:
-    """The states of a case that an estimate refuses, as far as they can be made, after every check on each of them."""
+    """All states that can be made of a case that an estimate refuses, with every check made on each of them."""
     problems.attempt(partial(require_samples, case))
     if case.phantom is not None or case.body is not None:  # nothing to read one by one
         states = problems.attempt(partial(read_states, case, progress=progress))
@@ -360,7 +360,7 @@ def _checked_pair(
 
 
 def _without(image: Segmentation, absent: Collection[int]) -> Segmentation:
-    """The image with the absent tissues made void, which nobody looks at."""
+    """The image with absent tissues marked as void, which the checks leave out."""
     tissues = tuple(replace(t, role=Role.VOID) if i in absent else t for i, t in enumerate(image.tissues))
     return replace(image, tissues=tissues)
 

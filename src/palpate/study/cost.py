@@ -22,7 +22,7 @@ from palpate.progress import STAGES, Stage
 from palpate.study.case import Case
 from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of
 
-MEMORY_FACTOR = 1.5  # how far the predicted memory may be off
+MEMORY_FACTOR = 1.5  # factor by which the predicted memory may be wrong
 
 LATTICE = 64  # points of the lattice along the longest side, on which edge lengths are summed
 # Fitted to runs of benchmarks/cost.py (docs/command-line.md), between machines that take 110 and 160 s for the demo.
@@ -35,15 +35,15 @@ INTERVALS_S = 4.6e-4  # the same of intervals, and of what would change the answ
 FROM_REST = 2  # further passes, each with a linear one, where the state without loads is found with the moduli
 SECONDS_A_DRAW = 0.039  # of the posterior, in four chains, with 90 modes, for each later image
 SECONDS_A_CUT = 2.0e-4  # of meshing, for each tetrahedron and each tissue that is cut out
-PARALLEL_SHARE = 0.3  # of the time, that more processors shorten
+PARALLEL_SHARE = 0.3  # share of the time that more processors shorten
 FIXED_GB = 0.48
 GB_AN_UNKNOWN = 1.7e-5  # beside the factor, with 90 modes
 BYTES_A_VOXEL = 6.0  # of each image: the tissue of each voxel, and masks
-BYTES_A_DISTANCE = 81.0  # while the distance map of a tissue is made, for each voxel around it
+BYTES_A_DISTANCE = 81.0  # for each voxel around a tissue, while its distance map is made
 LESS_MEMORY = 'make mesh.edge_length_mm larger, or domain.extent = "margin" with a smaller margin_mm'
 USUAL_MODES = 90
-OVERHEAD_MODES = 10  # what an unknown costs without any mode, in modes
-SERIES = 30  # right-hand sides beside the modes
+OVERHEAD_MODES = 10  # cost of an unknown without any mode, in modes
+SERIES = 30  # further right-hand sides beside those of the modes
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from palpate.mesh.surface import cut_faces
 from palpate.uncertainty import NORMAL_95, FittedState
 from palpate.unknowns import LAYER, in_series
 
-TOLD = 2.0  # standard deviations, from which an offset is said in words
+TOLD = 2.0  # standard deviations, above which an offset is reported in words
 LEAST_TOLD_MM = 0.1
 
 

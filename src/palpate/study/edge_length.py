@@ -17,14 +17,14 @@ from palpate.study.case import Case
 
 ACROSS_BALL = {Role.ESTIMATE: 5.0, Role.DRIVER: 4.0}  # edges across a ball of the tissue's volume
 ACROSS_THIN = 2.5  # edges across its thickness
-SURFACE_MM = 12.0**-0.5  # standard deviation of a place in a voxel of 1 mm, for which these numbers hold
-FACTORS = (0.75, 1.5)  # least and most, times that edge length, for better and worse surfaces
-LEAST_MM, LEAST_VOXELS = 3.0, 2.0  # shorter edges cost more than they show
-LONGEST_MM = 8.0  # of a quadratic element, which has a point of the surface every 4 mm
-LINEAR = 0.5  # times the edge length of quadratic elements: the same points
-STEP_MM = 0.25  # to which the edge length is rounded
-UNLIKE = 1.5  # longest over shortest edge length of organs, from which each has its own
-MOST_VOXELS = 128  # along each axis, in which a thickness is measured
+SURFACE_MM = 12.0**-0.5  # standard deviation of rounding to voxels of 1 mm, for which these numbers hold
+FACTORS = (0.75, 1.5)  # least and largest factor on the edge length for better and worse surfaces
+LEAST_MM, LEAST_VOXELS = 3.0, 2.0  # shortest edges; shorter ones cost more than they improve
+LONGEST_MM = 8.0  # longest edge of a quadratic element, which has a point every 4 mm
+LINEAR = 0.5  # factor for linear elements, which gives as many points as quadratic ones
+STEP_MM = 0.25  # step to which the edge length is rounded
+UNLIKE = 1.5  # longest over shortest edge length of organs, above which each organ has its own
+MOST_VOXELS = 128  # largest number along each axis in which a thickness is measured
 
 
 @dataclass(frozen=True, slots=True)

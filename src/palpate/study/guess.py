@@ -84,7 +84,7 @@ def guess_tissues(before: LabelImage, after: Sequence[LabelImage] = ()) -> tuple
     surroundings = list[GuessedTissue]()
     rest = [before.names.get(g.labels[0], f"label {g.labels[0]}") for g in guesses if g.name == SURROUNDINGS]
     fat, muscle = usual_stiffness("fat"), usual_stiffness("muscle")
-    if rest and fat is not None and muscle is not None:  # both stand in the table
+    if rest and fat is not None and muscle is not None:  # both names are in the table
         value = round(float(np.sqrt(fat.usual_kpa * muscle.usual_kpa)), 2)
         reason = (
             f"all that no other tissue names ({', '.join(rest)}); {value:g} kPa lies between fat and muscle"
@@ -188,7 +188,7 @@ def _by_place(label: int, before: LabelImage, after: Sequence[LabelImage], borde
     alike = [image.labels for image in after if image.labels.shape == mask.shape]
     changed = [int(np.count_nonzero((labels == label) != mask)) for labels in alike]
     still = max(changed, default=np.inf) < STILL_SHARE * int(np.count_nonzero(mask))
-    if still and len(alike) == len(after):  # whether a voxel changes is not seen on another grid
+    if still and len(alike) == len(after):  # on another grid voxels cannot be compared
         return GuessedTissue(name, (label,), Role.RIGID, "its voxels do not move at all, as only bone's do")
     if abs(change) > HOLLOW_CHANGE:
         return GuessedTissue(

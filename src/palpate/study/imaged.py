@@ -22,14 +22,14 @@ from palpate.progress import Progress, silent
 from palpate.study.contacts import every_finding
 from palpate.study.refusals import refuse_lost, refuse_unmeshable
 
-SMALL_FRAME_MOTION = 1.0 / 3.0  # of what the organs do against each other: a smaller one is not worth a word
-LEVER_MM = 25.0  # about the size of an organ, at which a turn counts as a motion
-SEEN_MM = 0.2  # less is the measurement's own error
+SMALL_FRAME_MOTION = 1.0 / 3.0  # of the organs' relative motion: a smaller motion of the frame is not reported
+LEVER_MM = 25.0  # about an organ's size: the lever that turns a rotation into a motion
+SEEN_MM = 0.2  # smaller motions are within the measurement's error
 STATED = (
     "motion-below-noise",
     "sides-exchanged",
     "front-exchanged",
-)  # findings on contacts stand in the result as observed shares
+)  # findings on contacts are in the result as observed shares
 
 
 @dataclass(frozen=True, slots=True)

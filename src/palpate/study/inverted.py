@@ -18,7 +18,7 @@ from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
 
 PASSES = 10
-SETTLED = 1e-3  # of ln E: what the next pass would change is less, by the strain of the reference
+SETTLED = 1e-3  # of ln E: change at which the passes stop; the next one would change less, by the reference's strain
 
 
 def inverted(

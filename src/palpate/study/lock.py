@@ -74,7 +74,7 @@ def folder_lock(folder: Path) -> Iterator[bool]:
         if not same:
             os.close(file)
     if locked:
-        with suppress(OSError):  # who holds the lock is a courtesy; a full disk must not cost the run here
+        with suppress(OSError):  # the owner's name is for information only; a full disk must not end the run here
             os.ftruncate(file, 0)
             os.write(file, str(os.getpid()).encode())
     try:

@@ -86,7 +86,7 @@ def with_prescribed(states: ImagedStates, case: Case) -> ImagedStates:
 
 
 def _findings(file: MeshFile, case: Case) -> tuple[Finding, ...]:
-    """What is odd of a mesh: its size, several pieces; `InputDataError` where surfaces would take all of it."""
+    """Findings on a mesh's size and pieces; `InputDataError` where named surfaces would take all of it."""
     found, length = list[Finding](), float(np.ptp(file.nodes, axis=0).max())
     if not USUAL_MM[0] <= length <= USUAL_MM[1]:
         unit, factor = ("metres", 1e3) if length < USUAL_MM[0] else ("micrometres", 1e-3)

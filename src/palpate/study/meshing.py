@@ -19,9 +19,9 @@ from palpate.study.case import Case
 from palpate.study.cost import expected_cost, lack_of_memory
 from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of
 
-FINER = 0.75  # times an edge length whose mesh is not fit: the next one's
-FINER_MESHES = 2  # at the most
-THIN_VOXELS = 4  # along some axis
+FINER = 0.75  # factor on an edge length whose mesh fails, for the next attempt
+FINER_MESHES = 2  # largest number of further attempts
+THIN_VOXELS = 4  # thickness along an axis, below which a tissue is thin
 
 
 @dataclass(frozen=True, slots=True)

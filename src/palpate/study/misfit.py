@@ -19,12 +19,12 @@ from palpate.study.poisson_ratios import PoissonRatioEstimate
 
 T = TypeVar("T", ModulusEstimate, PoissonRatioEstimate)
 
-CHANCE = 1e-3  # that errors as they are believed to be look so: of ten kinds of data, a false alarm in a hundred runs
-RELEVANT = 1.5  # times what noise explains: less, however sure, hardly moves a modulus
-DIRECTIONS = 30.0  # independent tests that the worst of all directions stands for: by simulation, of 1 to 200 points
+CHANCE = 1e-3  # probability of a false alarm for each kind of data: with ten kinds, one in a hundred runs
+RELEVANT = 1.5  # times the noise; a smaller misfit, however certain, hardly changes a modulus
+DIRECTIONS = 30.0  # number of independent tests to which the worst direction amounts, by simulation of 1 to 200 points
 TAIL, MOST = 0.05, 0.5  # shares of the data that lie far off: too many by chance, and too many to be named one by one
 AXES = ("x (right)", "y (anterior)", "z (superior)")
-ALONG = 0.9  # cosine to an axis, from which on a direction is told as that axis
+ALONG = 0.9  # cosine to an axis, above which a direction is named as that axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +116,7 @@ def _of_points(line: Linearisation, motions: PointMotions) -> Misfit | None:
         return Misfit(name, line.state, times, short, text, whole=False)
     if smooth[0] > max(times, limit):
         (times, direction), scaled = smooth, alone
-    along = left.T @ (scaled @ direction)  # in space, whatever the errors' covariance makes of it
+    along = left.T @ (scaled @ direction)  # the direction in space, from that of the scaled residuals
     along *= np.sign(along[np.abs(along).argmax()]) / np.linalg.norm(along)
     words = "".join(axis for axis, cosine in zip(AXES, along, strict=True) if cosine > ALONG)
     words = words or f"({', '.join(f'{cosine:.2f}' for cosine in along)})"
@@ -188,7 +188,7 @@ def _worst_direction(scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.flo
 
 
 def _limit(count: float, directions: float) -> float:
-    """Root mean square of so many independent residuals of standard deviation 1 that tells of more than noise."""
+    """Root mean square of so many independent residuals of standard deviation 1 that noise hardly exceeds."""
     return max(RELEVANT, float(np.sqrt(chi2.isf(CHANCE / directions, count) / count)))
 
 

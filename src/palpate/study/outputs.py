@@ -163,7 +163,7 @@ def recover(folder: Path) -> None:
 
 
 def _exchange(folder: Path, leaving: Sequence[str]) -> None:
-    """Let the `leaving` files step aside and the staged ones take their places; raises `OSError` with all as it was."""
+    """Move the `leaving` files aside and the staged ones to their places; an `OSError` leaves everything as it was."""
     area = folder / STAGING
     try:
         for name in leaving:

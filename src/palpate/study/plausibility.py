@@ -15,7 +15,7 @@ from palpate.study.case import Case
 from palpate.study.estimated import Estimation
 
 MARGIN = 3.0  # methods differ by ten to a hundred times: an estimate is doubtful only well outside what was published
-SOFT_TISSUE_KPA = (0.05, 1000.0)  # of a tissue for whose name nothing was published, with room on both sides
+SOFT_TISSUE_KPA = (0.05, 1000.0)  # of a tissue without published values, with room on both sides
 GIVEN_MARGIN = 10.0  # a modulus that is given lies outside what was published for its name by methods, a slip by 1000
 
 

@@ -15,7 +15,7 @@ from palpate.unknowns import ParameterMap, eta_of_ratio
 
 NOT_IDENTIFIED = "not identified"  # the verdict of what has no interval
 IDENTIFIED, WEAK = 0.05, 0.2  # largest width of an interval; soft tissue is usually given 0.40 to 0.49
-BELIEVED = 0.8  # of the prior's standard deviation: one that is not below it is the prior's
+BELIEVED = 0.8  # of the prior's standard deviation: a larger one shows that the data say nothing
 
 
 @dataclass(frozen=True, slots=True)

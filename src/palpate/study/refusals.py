@@ -24,8 +24,8 @@ from palpate.study.case import Case
 from palpate.study.cost import image_memory_gb, machine_memory_gb
 
 ORGANS, MESHED = (Role.ESTIMATE, Role.DRIVER), (Role.ESTIMATE, Role.KNOWN)
-LINEAR_RANGE = 0.10  # principal strain: beyond it the squares that the linear law leaves out are tenths of it
-MOST_BEYOND = 0.01  # share of the meshed volume
+LINEAR_RANGE = 0.10  # principal strain beyond which the neglected squares are over a tenth of it
+MOST_BEYOND = 0.01  # largest share of the meshed volume with larger strains
 NOTHING_MOVES = (
     'nothing moves this body: no tissue has role = "driver" (or "rigid", and moves between the images), and no load or'
     " force is known, so no modulus can be estimated; give the role driver to the hollow organ whose wall deforms the"

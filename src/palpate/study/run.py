@@ -150,10 +150,10 @@ def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
 def _what_would_change(
     inversion: Inversion, settings: InversionSettings, case: Case, bodies: tuple[Body, ...]
 ) -> tuple[Variation, ...]:
-    """What the estimate of a case rests on; nothing where not even the estimate itself can be followed.
+    """What would change the estimate of a case; nothing where the estimate itself cannot be followed.
 
-    A law at finite strain is held against the others of its kind, the linear one against the default: from a finite
-    strain no step leads to the linear law, nor to any where it would also find another reference state.
+    A finite-strain law is compared with other finite-strain laws, the linear law with the default one. A step from
+    finite strain cannot reach the linear law, nor a law under which the reference state would differ, too.
     """
     mechanics, later = case.mechanics, [image for body in bodies for image in body.states.after]
     finite = [name for name in LAW_NAMES if law_named(name).finite and name != mechanics.law]

@@ -48,7 +48,7 @@ from palpate.uncertainty import require_salib
 
 KEPT = "variants"  # folder of the finished parts
 COARSER = 1.25  # times the mesh's edge length
-VARIED = StopRule(step_sd=0.1)  # of a variant: a change by less of its standard deviations says nothing
+VARIED = StopRule(step_sd=0.1)  # of a variant's standard deviation: smaller changes are not significant
 BASE = ("tissue", "unit", "value", "interval95", "relative_to", "ratio", "ratio_interval95", "verdict", "why")
 
 Bodies = tuple[Body, ...]

@@ -14,8 +14,8 @@ from palpate.inversion import Bounds, FrozenPosterior, Inversion, Minimum, Objec
 from palpate.parallel import mapped
 from palpate.uncertainty import NORMAL_95, Covariance, modulus_interval, sandwich_covariance
 
-ROUNDS = 3  # of models made exact where profiles end, the most
-STAYS = 0.1  # of the half-width, by which an end may still move
+ROUNDS = 3  # largest number of times that models are made exact where profiles end
+STAYS = 0.1  # of the half-width: largest change of an end with which the rounds stop
 
 
 @dataclass(frozen=True, slots=True)

@@ -115,7 +115,7 @@ def surface_labels(
 
 
 def _flaws(name: str, surface: SurfaceFile, count: int, grid: VoxelGrid) -> list[Finding]:
-    """What the `count` of its voxels tells of a surface; raises `InputDataError` where there is none."""
+    """Findings by the number of a surface's voxels, `count`; raises `InputDataError` where there is none."""
     held, counted = surface.held_mm3, count * grid.voxel_volume
     volume, last = f"{held / 1000.0:.3g} mL", np.array(grid.shape) - 1.0
     if not count or np.ptp(surface.ends, axis=0).max() < 2.0 * grid.spacing.max():

@@ -87,7 +87,7 @@ class SobolResult:
 
 @dataclass(frozen=True, slots=True)
 class _Input:
-    """One thing that can be changed by an amount: errors of the residuals for a unit of it."""
+    """One input that can be changed by an amount, with the residuals' changes for a unit of it."""
 
     cause: str
     subject: str
@@ -203,7 +203,7 @@ def sobol_result(
     of = _inputs(inversion, _equilibria(inversion), tissues, dilatation, voxel_mm)
     inputs = [each for each in of if each.subject != ALL]
     ranges = [Range(i.cause, i.subject, min(i.amounts)[0], max(i.amounts)[0], i.unit) for i in inputs]
-    # what changes no residual: a known modulus that alone sets the scale, and the drivers' prior
+    # inputs that change no residual: a known modulus that alone sets the scale, and the drivers' prior
     if _exact(inversion, tissues):
         (known,) = {tissue.name for tissue in tissues if tissue.role is Role.KNOWN}
         scale = float(np.log(KNOWN_FACTOR))
@@ -253,8 +253,7 @@ def _inputs(
 ) -> tuple[_Input, ...]:
     """Poisson's ratio of each tissue and of all, each observed surface, known moduli where several set the scale.
 
-    A surface whose offset is an unknown of the estimate is none of them: no step from there says what another offset
-    would be found.
+    Surfaces whose offset is an unknown of the estimate are left out, because a step cannot change their offset.
     """
     objective, minimum = inversion.objective, inversion.minimum
     model = objective.states[0].model
@@ -298,7 +297,7 @@ def _poisson_steps(ratio: float) -> tuple[float, float]:
 
 
 def _exact(inversion: Inversion, tissues: tuple[Tissue, ...]) -> list[Variation]:
-    """The known modulus, where it alone sets the scale: every other one is proportional to it."""
+    """The exact effect of the known modulus where it alone sets the scale: all others are proportional to it."""
     mapping = inversion.objective.parameters
     known = list(dict.fromkeys(tissue.name for tissue in tissues if tissue.role is Role.KNOWN))  # layers are of theirs
     loaded = any(state.model.load.any() for state in inversion.objective.states)

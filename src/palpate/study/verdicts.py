@@ -129,7 +129,7 @@ def estimates_of(
         word, why = verdict(of.interval, at_bound=of.at_bound, absolute=mapping.absolute)
         why = why if of.followed or of.at_bound else NOT_FOLLOWED
         if word != "identified" and of_scale > 0.0:
-            # the ratio may say more than a modulus whose scale is known within a range alone
+            # the ratio may be known better than the modulus, where the scale is a range
             ratio_word, ratio_why = verdict(by_ratio, at_bound=of.at_bound, absolute=True)
             if ratio_word not in (NOT_IDENTIFIED, word):
                 left = "the range of the known modulus leaves more of it open in kPa"
@@ -159,7 +159,7 @@ def estimates_of(
 
 
 def _without(sd: float, interval: Interval, value: float, *, centre: float) -> Interval:
-    """An interval of a value about another centre, its half-widths in ln less those of an independent cause of it.
+    """An interval about another centre, with the half-widths in ln reduced by an independent cause.
 
     sd: that of the cause, in ln; h -> sqrt(h^2 - (1.96 sd)^2).
     """
@@ -172,7 +172,7 @@ def _without(sd: float, interval: Interval, value: float, *, centre: float) -> I
 
 
 def _stated(interval: Interval, word: str, unit: float = 1.0) -> Interval | None:
-    """The interval, times a unit, that a verdict lets stand: of what is not identified there is none."""
+    """The interval times a unit; none for a modulus that is not identified."""
     low, high = interval
     return None if word == NOT_IDENTIFIED else (low and low * unit, high and high * unit)
 

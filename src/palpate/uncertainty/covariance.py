@@ -29,8 +29,8 @@ GridErrors = Sequence[Sequence[NDArray[np.float64]]]
 """Errors (n,) mm of the residuals of each observation, of each draw of a grid."""
 
 GRID_DRAWS = 8
-ROUNDING = 1e-6  # of a variance: what blocks that are held have left of it
-MARGIN_MM, MARGIN_VOXELS = 12.0, 8.0  # around the residuals' places, further than a distance map there is smoothed
+ROUNDING = 1e-6  # share of a variance that is only rounding, as of blocks that are held
+MARGIN_MM, MARGIN_VOXELS = 12.0, 8.0  # of the grid around the residuals' places, wider than the maps' smoothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ def gain(evaluation: Evaluation, n_parameters: int) -> tuple[NDArray[np.float64]
 
 
 def _gain(evaluation: Evaluation, rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """The same of combinations of the unknowns, with their rows (k, n_unknowns) of H^-1."""
+    """The gain of combinations of the unknowns, by their rows (k, n_unknowns) of H^-1."""
     return tuple(
         s.jacobian.times(rows[:, s.columns].T).T * (s.precision * s.weights) for s in evaluation.linearisations
     )
@@ -144,7 +144,7 @@ def covariance_of(
     for cause, part in (item for of in further for item in of.items()):
         causes[cause] = causes.get(cause, np.zeros_like(part)) + part
     for i, block in enumerate(objective.parameters.blocks):
-        if not block.released:  # its share is that of `with_released`
+        if not block.released:  # `with_released` adds the share of these
             own = objective.parameters.columns(i)
             part = inverse[own].T @ evaluation.prior[np.ix_(own, own)] @ inverse[own]
             causes[block.cause] = causes.get(block.cause, np.zeros_like(part)) + part
@@ -241,7 +241,7 @@ def _sandwich(
     rows: NDArray[np.float64],
     noise_of: Mapping[tuple[int, str], NoiseModel],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Its two parts, (k, k) each, of unknowns with their rows (k, n_unknowns) of H^-1: by residuals, by the prior."""
+    """The sandwich's parts (k, k) by residuals and by prior, of unknowns with rows (k, n_unknowns) of H^-1."""
     data = noise_covariance(
         objective, list(zip(evaluation.linearisations, _gain(evaluation, rows), strict=True)), noise_of
     )
@@ -416,7 +416,7 @@ def _imaged(
     margin_mm: float,
     rng: np.random.Generator,
 ) -> Segmentation:
-    """The model's image around places (n, 3) mm; further away nobody looks at it."""
+    """The model's image around places (n, 3) mm, where alone it is used."""
     margin = max(margin_mm, MARGIN_VOXELS * float(grid.spacing.max())) / float(grid.spacing.min())
     near = cropped(grid, window_of(grid.index(np.concatenate(places)), grid, margin=math.ceil(margin)))
     affine = np.array(near.affine)

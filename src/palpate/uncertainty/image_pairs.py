@@ -28,10 +28,10 @@ from palpate.uncertainty.covariance import (
 )
 from palpate.uncertainty.intervals import NORMAL_95, within_subject_cv
 
-OUTLIER = 0.01  # probability, over all pairs together, of calling one an outlier that is none
-MOST_OUTLIERS = 4  # one of so many: where more contradict the others the pairs differ, and none is wrong
-LEAST_PAIRS = 3  # of two that differ nobody can say which is wrong
-BETWEEN_GRIDS = 0.5  # of what few draws say of two pairs together: all of it leaves combinations without variance
+OUTLIER = 0.01  # probability of a false outlier among all pairs
+MOST_OUTLIERS = 4  # at most one pair of four is an outlier; where more differ, the pairs vary and none is wrong
+LEAST_PAIRS = 3  # of two pairs that differ, either may be wrong
+BETWEEN_GRIDS = 0.5  # factor on the covariance of two pairs from few draws, which keeps the whole positive
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,9 +133,9 @@ def _each_alone(objective: Objective, minimum: Minimum, bounds: Bounds) -> list[
 def _noise_and_prior(objective: Objective, alone: Sequence[Minimum]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Covariances (n_pairs n, n_pairs n) of the estimates of each state alone by noise, and by the prior.
 
-    With the gains G_s of the residuals and H_s^-1 of each: by the noise, of which half is the rest image's, which those
-    of one reference share, G_s C_st G_t^T; by the prior, H_s^-1 P_st H_t^-1, which counts once of what they have in
-    common.
+    G_s is the gain of the residuals and H_s the Gauss-Newton matrix of a state s. By noise it is G_s C_st G_t^T. Half
+    of the noise is the rest image's, which states of one reference share. By the prior it is H_s^-1 P_st H_t^-1, where
+    common unknowns count once.
     """
     n, mapping = objective.n_parameters, objective.parameters
     size, pairs, noise = n * len(alone), [], dict[tuple[int, str], NoiseModel]()

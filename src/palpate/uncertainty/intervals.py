@@ -16,9 +16,9 @@ from palpate.uncertainty.profile import Profile, profile
 Interval = tuple[float | None, float | None]
 
 NORMAL_95 = 1.959964
-AS_ELLIPSE = 0.1  # of the half-width: an end of the profile that is no further from the ellipse's says the same
+AS_ELLIPSE = 0.1  # of the half-width: largest distance of the profile's end for which the ellipse is stated
 COEFFICIENT = 0.5
-LINEAR = 2.0  # edges of quadratic elements for one of linear ones: they have the same points
+LINEAR = 2.0  # factor on the edge of linear elements, which have half as many points along an edge
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,13 +32,13 @@ from palpate.inversion import (
 TRIALS = 12  # points on a ray from the estimate
 DIRECTIONS = 16  # of a joint region
 JOINT_LEVEL = float(np.sqrt(special.chdtri(2, 0.05)))  # root deviance on its boundary: two degrees of freedom
-TRIES = 3  # at a point, of as many steps as a minimum has
-NEAR = 0.05  # of the level, to which an end is found before a line to the estimate corrects it
-FURTHEST = 2.0  # times the distance of the last point: more is not extrapolated
+TRIES = 3  # searches at a point, each with as many steps as a minimum
+NEAR = 0.05  # of the level: accuracy of an end before a straight line corrects it
+FURTHEST = 2.0  # largest extrapolation, times the distance of the last point
 PASSES = 10
-SETTLED = 0.02  # posterior standard deviations, as the outer loop's own
+SETTLED = 0.02  # posterior standard deviations, as in the outer loop
 TOLERANCE = 1e-6  # decrement of a minimum
-ON_RAY = 0.01  # of one on a ray, of the 1.92 at an interval's end: a quarter of a per cent of its half-width
+ON_RAY = 0.01  # decrement of a minimum on a ray; of the 1.92 at an end that is 0.25 % of the half-width
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ class Ray:
         return float(np.min((limits - theta)[along] / self.direction[along]))
 
     def _slope(self) -> NDArray[np.float64]:
-        """Change (n_unknowns,) of all unknowns for a distance of 1 at the minimum, those that are not held following.
+        """Change (n_unknowns,) of all unknowns for a distance of 1 from the minimum; those that are not held follow.
 
         H_ff s_f = -H_fh s_h with the Gauss-Newton matrix H; a log-modulus at a bound stays.
         """
@@ -120,7 +120,7 @@ class Ray:
         return slope
 
     def _at_its_best(self, start: NDArray[np.float64]) -> Minimum:
-        """All that is not held at its best, sought from unknowns (n,), and once more from where that did not end."""
+        """The minimum over all that is not held, sought from unknowns (n,), and again from where a search stopped."""
         bounds = self.bounds.fixed(start[: len(self.held)], self.held)
         for _ in range(TRIES):
             found = gauss_newton(self.fixed, start, bounds=bounds, tolerance=ON_RAY)

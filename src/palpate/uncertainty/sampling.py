@@ -16,13 +16,13 @@ from palpate.inversion.objective import Evaluation
 from palpate.inversion.optimise import Bounds
 from palpate.unknowns.blocks import in_series, in_series_slopes, of_series
 
-STEP = 0.35  # of a proposal, in standard deviations of the posterior
-THIN = 10  # steps of a draw that is kept
-SHRUNK = 1.0 - 1e-9  # of a start's distance: one at a bound lies inside whatever rounding does
-SPREAD = 1.5  # standard deviations, by which chains start apart
-BLOCK = 4000  # proposals at once: those of all steps would take gigabytes
+STEP = 0.35  # length of a proposal, in standard deviations of the posterior
+THIN = 10  # steps for each draw that is kept
+SHRUNK = 1.0 - 1e-9  # factor on a start's distance, so that a start at a bound lies inside despite rounding
+SPREAD = 1.5  # standard deviations between the chains' starts
+BLOCK = 4000  # proposals drawn together: those of all steps would take gigabytes
 LARGEST_R_HAT = 1.01
-LEAST_ESS = 400.0  # of the bulk, for R-hat itself is a number of chance with fewer
+LEAST_ESS = 400.0  # of the bulk; with fewer, R-hat itself is too random
 TAILS = (0.05, 0.95)  # quantiles
 
 

@@ -35,10 +35,10 @@ from palpate.observation.contract import Imaged, OfMaterial, seen_by
 from palpate.uncertainty.profile import PASSES, refitted
 
 TOLERANCE = 1e-6  # decrement of a minimum
-STEPS = 120  # at the most: a modulus that runs away has far to go
+STEPS = 120  # at the most, for a modulus that moves far
 COARSE = NewtonSettings(tolerance=2e-3, step_tolerance=1e-2)  # of the forces, under another law
 DERIVATIVES = 1e-4  # relative residual of those by Poisson's ratios
-DROPPED = 1e10  # precision of a coefficient that is held at 0: its own is 1
+DROPPED = 1e10  # precision of a coefficient that is held at 0; a free one has 1
 
 Errors = tuple[NDArray[np.float64], ...]  # changes (n,) mm of each observation's residuals
 Equilibria = Sequence[LinearEquilibrium | FiniteStrainEquilibrium]  # of each later state

@@ -17,10 +17,10 @@ from palpate.uncertainty.covariance import covariance_among
 from palpate.uncertainty.intervals import NORMAL_95, Interval
 from palpate.unknowns import FIELD, Acts, TotalVariation
 
-CONTRAST = 1.5  # from which a part of a tissue is another stiffness, and not its own scatter
+CONTRAST = 1.5  # least ratio for a part to have another stiffness than its tissue
 CERTAIN, LIKELY = 0.95, 0.5  # posterior probability of that: somewhere in a region that is reported, all over it
 MM3_PER_ML = 1000.0
-SMOOTH = 1e-6  # of the prior's precision: modes that no element tells apart
+SMOOTH = 1e-6  # of the prior's precision, added for modes that elements do not separate
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ class _Field:
         return np.asarray(np.maximum(self.prior_variance + change, 0.0))
 
     def free_along(self, shape: NDArray[np.float64], volumes: NDArray[np.float64]) -> _Field:
-        """The posterior if nothing were believed beforehand of how much of a `shape` (n,) the field has.
+        """The posterior with a flat prior along a `shape` (n,) of the field.
 
         With h the shape's coefficients, by volumes (n,), and P h = p: the prior's precision is P - p p^T / h^T p then,
         so that x gains C p p^T (x - m) / d, m its mean, and C gains C p p^T C / d, d = p^T (h - C p) (Sherman and
@@ -120,7 +120,7 @@ class _Field:
     def _varied_along(
         self, h: NDArray[np.float64], precision: NDArray[np.float64], variation: TotalVariation
     ) -> _Field:
-        """The same where the prior is a variation, of the field less so much of the shape as leaves the least of it.
+        """The same under a total variation, of the field less the multiple of the shape that lowers it most.
 
         x = y + a h with a free and y under the prior, of data with the information A = C^-1 - P and the pull A x + P (x
         - m): A' = A - A h h^T A / h^T A h is what they say of y, to second order about where it is likeliest.
@@ -195,7 +195,7 @@ def stiffness_maps(inversion: Inversion, variances: NDArray[np.float64]) -> tupl
 
 
 def _region(mesh: TetMesh, elements: NDArray[np.int64], field: _Field) -> DifferentRegion | None:
-    """The largest connected part that is likely another stiffness, and certainly so somewhere; None: there is none."""
+    """The largest connected part that probably has another stiffness, somewhere with near certainty; or None."""
     sd, volumes = np.sqrt(np.maximum(field.variance, 1e-300)), mesh.volumes[elements]
     parts = list[tuple[float, NDArray[np.int64], NDArray[np.float64]]]()
     for sign in (1.0, -1.0):
@@ -213,7 +213,7 @@ def _region(mesh: TetMesh, elements: NDArray[np.int64], field: _Field) -> Differ
         return None
     volume_ml, inside, probability = max(parts, key=lambda found: found[0])
     outside = ~np.isin(np.arange(len(elements)), inside)
-    # A normal law blurs the border: the core alone is all of the part. A variation draws it: the core would be chance.
+    # A normal law blurs the border, so only the core lies wholly in the part. A variation has a sharp border.
     core = ~outside & ((probability > CERTAIN) | (field.variation is not None))
     weights = core * volumes / volumes[core].sum() - outside * volumes / max(float(volumes[outside].sum()), 1e-300)
     free = field.free_along(core - np.average(core, weights=volumes), volumes)

@@ -24,21 +24,21 @@ from palpate.observation.prescribed_motion import PrescribedMotion
 from palpate.observation.wall_modes import Wall
 from palpate.unknowns.total_variation import TotalVariation, total_variation
 
-AMPLITUDES = (0.005, 2.0)  # times the coefficients' own standard deviation
-STILL, SLIGHT = 0.02, 0.1  # of a frame that stands still, that hardly moves, times one that moves
-MOVES = (1.0, 2.0)  # amplitudes of a frame, times what is stated
+AMPLITUDES = (0.005, 2.0)  # bounds, times the standard deviation of the coefficients
+STILL, SLIGHT = 0.02, 0.1  # motion of a frame that stands still, and that hardly moves, over that of a moving one
+MOVES = (1.0, 2.0)  # bounds of a frame's amplitude, times the stated one
 STILL_RIGID, MOVED_RIGID = 0.005, 0.2
-DRAWN_ALIKE, SELDOM = 0.1, 0.01  # an offset of a surface that is drawn alike, over that of others; how often not
+DRAWN_ALIKE, SELDOM = 0.1, 0.01  # sd of an offset of surfaces drawn alike, over that of others; odds of the others
 KNOWN_MODULUS, FRAME = "known modulus", "frame"
 FIELD, LAYER = "field", "layer"
-LEFT_OUT, LEFT_OUT_OF_MAP = 1.0, 0.3  # see `Block.left_out`; what is left out of a map is missing in it
-FIELD_AMPLITUDES = (1.0, 2.0)  # of a tissue that is mapped, times the standard deviation stated
-CONSIDERED = 1e8  # times its precision: an unknown that is considered does not move
-# sd of ln E in a tissue that is nearly homogeneous, patchy, very patchy, over that stated; log prior odds of these: not
-# homogeneous is 3 to 10, by how much as likely the one as the other
+LEFT_OUT, LEFT_OUT_OF_MAP = 1.0, 0.3  # see `Block.left_out`; less for a map, which would lack those modes
+FIELD_AMPLITUDES = (1.0, 2.0)  # of a mapped tissue, times the stated standard deviation
+CONSIDERED = 1e8  # factor on the precision of a considered unknown, which then does not move
+# standard deviation of ln E in a tissue that is nearly homogeneous, patchy, very patchy, over the stated one; and the
+# log prior odds of the three: 1, 0.15 and 0.15
 PATCHINESS: tuple[float, ...] = (1.0 / 3.0, 1.0, 2.0)
 PATCHY_ODDS = (0.0, -1.9, -1.9)
-LAYER_ODDS = -1.9  # log prior odds that layers differ from their tissue, as seldom as a tissue is patchy
+LAYER_ODDS = -1.9  # log prior odds that layers differ from their tissue: those of a patchy tissue
 
 
 class Acts(Enum):

@@ -75,7 +75,7 @@ class _Layout:
 
     @classmethod
     def of(cls, blocks: Sequence[Block], first: int, n_regions: int) -> _Layout:
-        """That of blocks whose unknowns follow each other, the first of them with a number."""
+        """The layout of blocks whose unknowns follow each other, from the number of the first one."""
         ends = np.cumsum([first, *(block.size for block in blocks)])
         places = tuple(np.arange(*pair) for pair in pairwise(ends.tolist()))
 

@@ -11,9 +11,9 @@ from scipy import linalg, sparse
 from palpate.images.tissue import FieldPrior
 from palpate.mesh.tet_mesh import FACES, TetMesh
 
-ROUNDING = 0.2  # of the stated standard deviation: smaller jumps count by their squares
-WEAK = 4.0  # stated standard deviations: of the normal law beneath, which leaves the edges to the variation
-SETTLED = 1e-3  # of ln E: by which a jump may still change
+ROUNDING = 0.2  # of the stated standard deviation: the variation of smaller jumps is quadratic
+WEAK = 4.0  # standard deviation of the underlying normal law, in stated ones: so wide that it does not smooth edges
+SETTLED = 1e-3  # of ln E: largest change of a jump at which the iteration ends
 REWEIGHTINGS = 60
 
 
@@ -87,7 +87,7 @@ def total_variation(mesh: TetMesh, fields: sparse.csr_matrix[np.float64], prior:
     own = np.flatnonzero(np.diff(fields.indptr))
     faces = np.sort(mesh.tets[own][:, FACES].reshape(-1, 3), axis=1)
     different, face, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(face.ravel(), kind="stable")  # elements of one face stand beside each other
+    order = np.argsort(face.ravel(), kind="stable")  # the two elements of a face follow each other
     inner = np.flatnonzero(count == 2)
     first = (np.cumsum(count) - count)[inner]
     owner = np.repeat(own, len(FACES))[order]

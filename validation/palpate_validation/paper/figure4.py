@@ -1,4 +1,4 @@
-"""Figure 4: how the error grows with the deformation when the truth is of finite strain, and where linear must end."""
+"""Figure 4: how the linear law's error grows with the deformation when the truth has finite strain."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ Moduli = tuple[float, float, float]
 
 LAW = "neo-hookean"
 LINESTYLES = {"linear": "-", LAW: "--"}
-LEAVE_PERCENT = 5.0  # error at which the linear law is said to end
+LEAVE_PERCENT = 5.0  # error from which on the linear law is not used
 
 NOTES = (
-    "Truth: neo-Hookean, on the mesh that inverts it: the law alone makes the error. A known dead pull, as in table 1.",
-    "The deformation is the mean of the largest |stretch - 1| over the body itself.",
-    "With one modulus in all bodies the curve is the same for every modulus: the load scales with it.",
+    "The truth is neo-Hookean, on the mesh that inverts it, so only the law makes an error. The load is as in table 1.",
+    "The deformation is the mean over the body of the largest |stretch - 1|.",
+    "With one modulus in all bodies the curve is the same for every modulus, because the load scales with it.",
 )
 
 

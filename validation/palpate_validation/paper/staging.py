@@ -1,4 +1,4 @@
-"""The paper's application: moduli against the T stage, in a cohort that is simulated in the shape of its own."""
+"""The paper's application: moduli against the T stage, in a simulated cohort of the same size."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ MOST_POINTS = 2000
 
 KEYS = ("per_scan", "per_patient", "regression")
 NOTES = (
-    "All patients are simulated: random pelves, moduli made to grow with the stage, noisy surfaces, no voxels.",
-    "Data and estimates share one mesh a patient: this shows the statistics, not the accuracy of the method.",
-    "A scan is not a patient: the p over scans takes all pairs of a few bodies for as many bodies.",
-    "The patient is the unit here: its test takes all arrangements of the stages among the patients.",
+    "All patients are simulated: random pelves, moduli that grow with the stage, noisy surfaces, no voxels.",
+    "Data and estimates of a patient share one mesh, so this shows the statistics, not the accuracy of the method.",
+    "A scan is not a patient: the p over scans treats all pairs of a few bodies as different bodies.",
+    "per_patient: the patient is the unit; its test permutes the stages among the patients.",
 )
 
 
@@ -80,9 +80,9 @@ def staging(settings: CohortSettings) -> Scenes[Staging]:
 
 
 def with_stage(kpa: Sequence[Sequence[float]], stages: NDArray[np.float64]) -> dict[str, Any]:
-    """What the moduli (kPa) of each patient have to do with stages (n_patients,), per scan and per patient.
+    """How the moduli (kPa) of each patient depend on the stages (n_patients,), per scan and per patient.
 
-    Estimates have no intervals here: they scatter as they do.
+    The estimates have no intervals here.
     """
     values = [np.array(part) for part in kpa]
     found = asdict(association(values, values, stages))
@@ -96,14 +96,14 @@ def with_stage(kpa: Sequence[Sequence[float]], stages: NDArray[np.float64]) -> d
 
 
 def paper_remark() -> str:
-    """What the paper's r and p say of its number of points."""
+    """The number of points that the paper's r and p imply, in a sentence."""
     counts = {organ: points_behind(r, p) for organ, (r, p) in PAPER_STAGING.items()}
     r, p = PAPER_STAGING["prostate"]
     patients = {organ: pearson_p(r, 8) for organ, (r, _) in PAPER_STAGING.items()}
     return (
-        f"The paper's r = {r:g} gives its p = {p:.2e} at n = {counts['prostate']} points and at no other number near it"
-        f" (the bladder's at n = {counts['bladder']}), neither its 8 patients nor its 180 image sets; for 8 patients"
-        f" p would be {patients['prostate']:.3f} (prostate) and {patients['bladder']:.2f} (bladder)."
+        f"The paper's r = {r:g} has its p = {p:.2e} for n = {counts['prostate']} points (the bladder's for"
+        f" n = {counts['bladder']}), not for its 8 patients or its 180 image sets. For 8 patients p would be"
+        f" {patients['prostate']:.3f} (prostate) and {patients['bladder']:.2f} (bladder)."
     )
 
 

@@ -1,4 +1,4 @@
-"""Table 1: three concentric spheres of one modulus, and of three, from half of it."""
+"""Table 1: three concentric spheres with one modulus, and with three; each start is half of the truth."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ NEAREST = 40  # points of the truth that give its displacement at a place
 
 NOTES = (
     "The scale comes from a known load: the traction S n of a uniaxial stress S on the outside.",
-    "Displacements alone give ratios; of one modulus in all bodies, as in the paper's rows, they say nothing at all.",
-    "The load is such that the body which is deformed most is deformed by 9.5 %: it is proportional to the modulus.",
-    "So the six rows of one modulus are one problem in different units, solved once; each has voxels of its own.",
-    "voxels: 1 mm, a grid turned and shifted at random for every row, the body meshed from its labels.",
+    "Displacements alone give ratios of moduli. Where all bodies have one modulus, as in the paper, they give nothing.",
+    "The load deforms the most deformed body by 9.5 %, so it is proportional to the modulus.",
+    "So the six rows with one modulus are the same problem in different units, solved once; each has its own voxels.",
+    "voxels: 1 mm, on a grid turned and shifted at random for every row; the body is meshed from its labels.",
     "paper_method: its Eq. 4 on linear tetrahedra with L-BFGS, on data made with its own mesh, as in the paper.",
     "paper_method_other_mesh: the same on the data of the column other_mesh.",
 )
@@ -82,7 +82,7 @@ class Table1Settings:
 
 
 def table1(settings: Table1Settings) -> Scenes[Table]:
-    """All rows: those that are one problem in other units share all columns but the voxels'."""
+    """All rows; rows that are the same problem in other units share all columns but `voxels`."""
     units = list(dict.fromkeys(_first_like(moduli, settings.cases) for moduli in settings.cases))
     make = partial(_part, settings)
     jobs = [Job((f"{_name(moduli)} voxels",), make) for moduli in settings.cases]
@@ -115,7 +115,7 @@ def _part(settings: Table1Settings, key: str, progress: Progress) -> dict[str, A
 
 
 def _first_like(moduli: Moduli, cases: tuple[Moduli, ...]) -> Moduli:
-    """The first case with the same ratios: the load goes with the moduli, so it is the same problem in other units."""
+    """The first case with the same ratios: the load is proportional to the moduli, so only the units differ."""
     return next(case for case in cases if np.allclose(np.array(case) * moduli[0], np.array(moduli) * case[0]))
 
 

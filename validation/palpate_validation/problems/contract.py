@@ -1,4 +1,4 @@
-"""A problem with a known answer, and what a computation says of it."""
+"""A problem with a known answer, and the checks of a computation against it."""
 
 from __future__ import annotations
 

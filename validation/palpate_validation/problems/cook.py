@@ -22,7 +22,7 @@ __all__ = ["COOK_PROBLEMS", "INCOMPRESSIBLE", "deflection", "panel"]
 Array = NDArray[np.float64]
 
 TOLERANCE = 1.0
-INCOMPRESSIBLE = 27.73  # mm, plane strain at nu = 0.4999, extrapolated from three meshes: see docs/mechanics.md
+INCOMPRESSIBLE = 27.73  # mm, plane strain at nu = 0.4999, extrapolated from three meshes of our own
 
 
 def panel(n: int, nu: float) -> TetMesh:

@@ -1,4 +1,4 @@
-"""E1 to E6: what the estimator owes: recovery, scale, coverage, gradients, information, parameters at a bound."""
+"""E1 to E6, checks of the estimator: recovery, scale, coverage, gradients, information, parameters at a bound."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _recovery_checks() -> tuple[Check, ...]:
 
 
 def _scale_checks() -> tuple[Check, ...]:
-    """Nobody's modulus is known: the derivatives by ln E sum to nothing, and the estimate is of ratios."""
+    """No modulus is known: the derivatives by ln E sum to zero, and the estimate is of ratios."""
     model = twin_model(8, outer_known=False)
     tangent = model.solve(TRUTH, np.zeros(0)).tangent()
     together = float(np.abs(tangent.sum(axis=1)).max() / np.abs(tangent).max())

@@ -69,7 +69,7 @@ class Warped:
 
 
 def twin_model(n_surface: int = 8, *, outer_known: bool = True) -> LinearModel:
-    """The model with n_surface cells along the edges of its eighth; `outer_known` False: nobody's modulus is known.
+    """The model with n_surface cells along the edges of its eighth; `outer_known` False: no modulus is known.
 
     The flat sides are planes of symmetry, which `outer_constraint` would leave free beside tissues to be estimated.
     """
@@ -88,7 +88,7 @@ def twin_model(n_surface: int = 8, *, outer_known: bool = True) -> LinearModel:
 def twin_problem(
     model: LinearModel, noise: SmoothField | None = None, *, stated_noise: NoiseModel | None = None
 ) -> InverseProblem:
-    """Core and middle are observed; `noise` moves their later surfaces; stated_noise: what the estimate is told."""
+    """Core and middle are observed; `noise` moves their later surfaces; stated_noise: that of the case."""
     shells = ((5.0, 10.0, 5.0 + PUSH, LATER[0]), (10.0, 20.0, LATER[0], LATER[1]))
     places, weights = triangle_quadrature(7)
     observations = []

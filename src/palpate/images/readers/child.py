@@ -19,7 +19,7 @@ from palpate.images.readers.values import reduced
 
 try:
     import resource
-except ImportError:  # Windows: the process still keeps a crash to itself
+except ImportError:  # Windows has no limits, but a crash still ends this process alone
     LIMITED = False
 else:
     LIMITED = True
@@ -29,7 +29,7 @@ def main(request: str) -> None:
     """Read an image. `request`: JSON of the limits, "labels" or "intensities", the format's name, path, and grid."""
     limits, kind, name, path, grid = json.loads(request)
     with os.fdopen(os.dup(1), "wb") as pipe:  # to the parent
-        nowhere = os.open(os.devnull, os.O_WRONLY)  # where goes what a C library prints on standard output
+        nowhere = os.open(os.devnull, os.O_WRONLY)  # receives what a C library prints on standard output
         os.dup2(nowhere, 1)
         os.close(nowhere)
         _limit(*limits)
@@ -53,7 +53,7 @@ def main(request: str) -> None:
 
 
 def _limit(memory_bytes: int, cpu_seconds: int, wall_seconds: float) -> None:
-    """No more memory or time than this, no file written, no core dumped; an earlier, lower limit stays."""
+    """Limit memory and time, and forbid written files and core dumps; an earlier, lower limit stays."""
     if not LIMITED:
         return
     signal.signal(signal.SIGALRM, signal.SIG_DFL)  # which ends the process
@@ -71,7 +71,7 @@ def _read(name: str, path: Path, kind: str, place: Any) -> StoredImage:
         (nx, ny, nz), affine = place
         grid = VoxelGrid((nx, ny, nz), affine)
     for module in image_format.needless:
-        sys.modules[module] = cast("ModuleType", None)  # whoever imports it is told that it is not installed
+        sys.modules[module] = cast("ModuleType", None)  # importing it fails as if it were not installed
     return reduced(image_format.stored(path, grid), path, kind=kind)
 
 

@@ -24,9 +24,9 @@ from palpate.images.readers.registry import ImageFormat, StoredImage
 from palpate.images.readers.voxel_stream import MAX_VOXELS
 from palpate.processes import environment_of_child, name_of_end
 
-MAX_ANSWER = 2**24  # bytes of the line that goes before the voxels
+MAX_ANSWER = 2**24  # bytes of the line before the voxels
 DTYPE, DIGEST = re.compile(r"[<>|][iuf][1248]"), re.compile(r"[0-9a-f]{64}")
-NEVER_BEGAN = 1  # how Python ends that cannot import what it is to run; our code sends every failure
+NEVER_BEGAN = 1  # exit code of a Python that cannot import its module; our code reports every other failure
 ERRORS = {error.__name__: error for error in (ConfigurationError, InputDataError, ResourceError)}
 
 
@@ -48,7 +48,7 @@ def read_stored(
     Raises what the reader raises, `InputDataError` when it crashed, `ResourceError` when it ran over a limit.
     """
     if not image_format.read.__module__.startswith("palpate."):
-        return image_format.stored(path, grid)  # the program's own code, which another process would not find
+        return image_format.stored(path, grid)  # code of another program, which a new process would not find
     limits = replace(limits, cpu_seconds=image_format.patience * limits.cpu_seconds)
     place = grid and [grid.shape, grid.affine.tolist()]
     request = json.dumps([astuple(limits), kind, image_format.name, str(path), place])
@@ -60,7 +60,7 @@ def read_stored(
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env=environment_of_child(),  # on one thread: a pool of them would eat address space
+            env=environment_of_child(),  # on one thread, because a pool of threads would take address space
         )
     except OSError as error:
         raise _sudden_end(NEVER_BEGAN, path, limits) from error
@@ -75,7 +75,7 @@ def read_stored(
 
 
 def _sudden_end(code: int, path: Path, limits: ReadLimits) -> PalpateError:
-    """Why a process ended that sent no image, by its exit code."""
+    """Why a process ended without an image, by its exit code."""
     name = name_of_end(code)
     if code == NEVER_BEGAN:
         advice = f"is Palpate installed in {sys.prefix} and is memory left?"

@@ -23,7 +23,7 @@ from palpate.images.readers.values import label_values
 ENDINGS = (".nii.gz", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd")
 MOST_FILES = 10_000  # of any kind in the folder
 MOST_MASKS = 500
-MOST_LOOKED_AT = 20  # files in a folder without masks: do they say what they are?
+MOST_LOOKED_AT = 20  # files of a folder without masks that are opened to see what they are
 SAME_PLACE = 0.01  # of a voxel, at the corners: what rounding leaves
 
 
@@ -58,7 +58,7 @@ def read_mask_folder(folder: Path) -> StoredImage:
 
 
 def _inside(mask: StoredImage, file: Path) -> NDArray[np.bool_]:
-    """Its voxels that are not 0, which all have one value, whichever it is."""
+    """The voxels that are not 0, which must all have the same value."""
     labels = label_values(mask.values, file)
     inside, high = labels > 0, labels.max()
     if others := np.count_nonzero(inside & (labels != high)):

@@ -148,7 +148,7 @@ def nifti_affine(header: Any, path: Path) -> NDArray[np.float64]:
         flaw = f"a damaged qform: {flaw}" if flaw else "neither sform nor qform, so left and right are unknown"
         raise InputDataError(f"the header of '{path}' has {flaw}; set an sform, or export the image with one")
     if sform is not None and qform is not None:
-        # which of two places is right, nobody can tell here; half a voxel is more than rounding
+        # either place may be right; half a voxel is more than rounding
         apart, voxel = corners_apart([float(n) for n in header["dim"][1:4]], sform, qform)
         if apart > 0.5 * voxel:
             flaw = f"place its corners up to {apart:.3g} mm apart; delete the wrong one (set its code to 0)"

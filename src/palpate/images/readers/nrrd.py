@@ -78,7 +78,7 @@ def _fields(lines: list[str], path: Path) -> dict[str, Any]:
             name = SYNONYMS.get(name.strip().lower(), name.strip().lower())
         if name in NUMBERS and not PLAIN.fullmatch(value):  # Python reads 1_5 and digits of all scripts
             raise refused(path, name, value.strip(), "its numbers must be plain digits: correct it")
-        if name in VECTORS:  # without blanks in them; a bare nan, for an axis that is not in space, is none
+        if name in VECTORS:  # vectors without blanks; a bare nan, for an axis outside space, is no vector
             vectors = re.findall(r"\([^()]*\)|[^\s()]+", value.lower())
             value = " ".join("none" if each == "nan" else re.sub(r"\s+", "", each) for each in vectors)
         plain.append(f"{name}{colon}{value.strip()}")

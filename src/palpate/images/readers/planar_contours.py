@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 Contour = NDArray[np.float64]
-ON_EDGE = 0.01  # of a voxel: contours are written with some six digits
+ON_EDGE = 0.01  # of a voxel: rounding of contours, which are written with some six digits
 ON_SLICE = 0.05  # slices between a plane and the slice that it was drawn on
 SAME = 0.2  # of a voxel, between the points of a contour and those of its copy, which may be rounded
-WITHIN = 0.95  # of a contour's pixels in another one: it is a hole
-FILLED = 3.05  # planes' distances: no longer gap between planes is filled
+WITHIN = 0.95  # share of a contour's pixels in another one, above which it is a hole
+FILLED = 3.05  # of the planes' distance: larger gaps between planes are not filled
 INTERPOLATED, EMPTY, JOINED = "interpolated", "left empty, far from the next plane", "joined, for contours cross there"
 STEP, MOST_STEPS = 0.25, 4000  # pixels between points along an edge, from which distances are measured
 

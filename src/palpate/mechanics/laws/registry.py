@@ -10,7 +10,7 @@ from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
 
-REGISTERED = (Linear, NeoHookean, MooneyRivlin)  # a new law is a file, and its class here
+REGISTERED = (Linear, NeoHookean, MooneyRivlin)  # a new law is a file, and its class in this tuple
 
 LAWS: dict[str, Law] = {law.name: law for law in (kind() for kind in REGISTERED)}
 

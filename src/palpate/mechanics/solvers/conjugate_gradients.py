@@ -13,11 +13,11 @@ from palpate.errors import SolverError
 from palpate.mechanics.solvers.contract import together
 from palpate.parallel import mapped, processors
 
-WORTH_THREADS = 3_000_000  # products; below, handing them to a thread takes longer than it spares
-PART = 2**20  # bytes of a product made at once: what SciPy takes for more the system fills with zeros each time
-ROOM = 2**29  # bytes of the vectors of columns that are iterated together
-VECTORS = 8  # that a column takes
-FEWEST = 32  # columns together, below which products with a factor are slow
+WORTH_THREADS = 3_000_000  # multiplications, above which threads save time
+PART = 2**20  # bytes of a product that is computed at once; the system would fill larger arrays with zeros first
+ROOM = 2**29  # bytes for the vectors of all columns that are iterated together
+VECTORS = 8  # vectors for each column
+FEWEST = 32  # columns; products of a factor with fewer are slow
 
 Product = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # of a matrix (n, n) with vectors (n, k)
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-ROOM, FEWEST = 2**27, 64  # bytes of right-hand sides that are solved for together, and their number at the least
-EXACT = 1e-10  # relative residual of a solution of which nothing else is asked
+ROOM, FEWEST = 2**27, 64  # bytes of right-hand sides that are solved for together, and their least number
+EXACT = 1e-10  # default relative residual of a solution
 
 
 def together(unknowns: int, number: int, *, room: int = ROOM, fewest: int = FEWEST) -> list[slice]:

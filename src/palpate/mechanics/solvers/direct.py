@@ -17,14 +17,14 @@ from palpate.mechanics.solvers.contract import EXACT, Expectation, Factorisation
 from palpate.parallel import processors
 from palpate.processes import available_memory
 
-HOPELESS = 4.0  # times the free memory; a pattern of such a size is not analysed to know more exactly
+HOPELESS = 4.0  # times the free memory: a matrix of such an expected size is not even analysed
 MAX_REFINEMENTS = 8  # steps of conjugate gradients; where they do not suffice, double precision costs less
 # Measured on one thread of a 2.4 GHz AMD EPYC, 29 631 and 111 273 unknowns, blocks of right-hand sides: operations a
 # second; seconds for each number of the factor and right-hand side, and for each entry of a product with the matrix.
 SPEED = {np.dtype(np.float64): 3.5e10, np.dtype(np.float32): 6.8e10}
 PER_NUMBER = {np.dtype(np.float64): 1.2e-10, np.dtype(np.float32): 7.3e-11}
 PRODUCT = 6e-10
-PARALLEL = 0.85  # of a processor's speed that every further one adds
+PARALLEL = 0.85  # share of a processor's speed that each further one adds
 # Stiffnesses of quadratic tetrahedra of the same two sizes n: operations / n^2, numbers / n^(4/3), entries / n.
 OPERATIONS, FACTOR, WORK, ENTRIES = 21.0, 25.2, 6.0, 81.0
 

@@ -23,13 +23,13 @@ from palpate.mechanics.solvers.contract import EXACT, Expectation, Factorisation
 
 MAX_ITERATIONS = 2000
 SMOOTHER_DEGREE = 3
-# Measured on one thread of a 2.4 GHz AMD EPYC: seconds an entry of the matrix for set-up, and for each step of one
-# right-hand side, alone or among several; steps at nu 0.49 and moduli up to 50 to 1 (20 at nu 0.45 and 4 to 1).
+# Measured on one thread of a 2.4 GHz AMD EPYC: seconds for each entry of the matrix for the set-up, and for each step
+# of one right-hand side, alone or among several; steps at nu 0.49 and moduli of 50 to 1 (20 at nu 0.45 and 4 to 1).
 SET_UP = 5e-8
 STEP_ALONE, STEP_OF_MANY = 7.3e-9, 3.4e-9
 STEPS = 60
-BYTES_AN_ENTRY = 30.0  # of the matrix, for all levels
-ENTRIES = 81.0  # an unknown, in the stiffness of quadratic tetrahedra
+BYTES_AN_ENTRY = 30.0  # for each entry of the matrix, all levels together
+ENTRIES = 81.0  # of the stiffness of quadratic tetrahedra, for each unknown
 SMOOTHED_SHARE = 20.0  # the smoother damps the eigenvalues between their largest / SMOOTHED_SHARE and their largest
 
 

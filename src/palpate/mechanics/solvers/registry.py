@@ -15,11 +15,11 @@ from palpate.mechanics.solvers.contract import EXACT, Coarser, Expectation, Fact
 from palpate.processes import available_memory, total_memory
 
 SOLVERS = {solver.name: solver for solver in (direct.SOLVER, direct.MIXED, multigrid.SOLVER)}
-SINGLE = 1e-5  # relative residual that a factor in single precision leaves, or less
-TOLERANCE = 1e-8  # of a residual, relative to its right-hand side, which rounding may leave
-LARGEST_CONDITION = 1e13  # beyond it a direct solution has lost three digits of four to rounding
-USABLE = 0.8  # of the memory that is free: the rest is for what comes with the solutions
-SHARE = 0.5  # of all memory, so that the choice is the same whatever else runs, unless memory is short
+SINGLE = 1e-5  # relative residual that a factor in single precision reaches
+TOLERANCE = 1e-8  # relative residual that rounding may leave
+LARGEST_CONDITION = 1e13  # condition number beyond which a direct solution has lost most of its digits
+USABLE = 0.8  # of the free memory; the rest is for the solutions
+SHARE = 0.5  # of the machine's memory, so that other programs do not change the choice unless memory is short
 
 
 @dataclass(frozen=True, slots=True)
