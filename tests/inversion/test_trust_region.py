@@ -442,11 +442,11 @@ def unfollowed(basis, times):
         def error(self, _at):
             return ModelError(np.inf, np.zeros(0))
 
-        def update(self, at):
+        def update(self, at, others=()):
             if len(failures) < times:
                 failures.append(1)
                 raise NotConverged("folded")
-            return super().update(at)
+            return super().update(at, others)
 
     return Unfollowed(*(getattr(basis, field.name) for field in fields(basis)))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol, Self
@@ -109,9 +109,10 @@ class Approximation(Protocol):
         """Moduli (n_regions,) kPa where the derivatives that decide the estimate are exact; None: nowhere yet."""
         ...
 
-    def update(self, at: LinearisationPoint) -> Self:
+    def update(self, at: LinearisationPoint, others: Sequence[Self] = ()) -> Self:
         """The approximation made exact at a place: the displacement, and the derivatives along its directions.
 
+        others: of other states of the body, which are exact at these moduli already: their factorisation may serve.
         Raises `NotConverged` when the full model has no equilibrium there, `SolverError` when it cannot be solved.
         """
         ...
@@ -124,6 +125,14 @@ class Approximation(Protocol):
     def error(self, at: LinearisationPoint) -> ModelError:
         """What it misses at a place."""
         ...
+
+
+def updated(approximations: Sequence[Approximation], points: Sequence[LinearisationPoint]) -> list[Approximation]:
+    """The approximation of each state made exact at its place; raises as `Approximation.update` does."""
+    found = list[Approximation]()
+    for approximation, point in zip(approximations, points, strict=True):
+        found.append(approximation.update(point, found))
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,8 +169,9 @@ class ExactApproximation:
         """Moduli (n_regions,) kPa where the model was last solved: there all derivatives are exact."""
         return self.place.moduli
 
-    def update(self, at: LinearisationPoint) -> ExactApproximation:
+    def update(self, at: LinearisationPoint, others: Sequence[ExactApproximation] = ()) -> ExactApproximation:
         """The model solved at a place, and expanded there; raises as `Approximation.update` does."""
+        del others
         if at.same_as(self.place):
             return self
         return exact_approximation(self.linear, self.finite_strain, at, nearby=self)

@@ -8,6 +8,7 @@ are made those of the equilibrium there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -63,13 +64,14 @@ class Expansion:
         """Where it is exact."""
         return LinearisationPoint(self.equilibrium.moduli, self.equilibrium.coefficients)
 
-    def update(self, at: LinearisationPoint) -> Expansion:
+    def update(self, at: LinearisationPoint, others: Sequence[Expansion] = ()) -> Expansion:
         """The expansion around the equilibrium at another place, derivatives exact there along its directions.
 
         Along all where they are few. With directions D, the exact C along them and H the metric T becomes
         T + (C - T D) (D^T H D)^+ D^T H: of all T' with T' D = C the one that changes least. The other columns stay as
         they were where T was made. Raises `NotConverged` when there is no equilibrium.
         """
+        del others  # each state has a tangent stiffness of its own
         there, before = self, self.equilibrium
         if not at.same_as(self.place):  # start at the displacement of the expansion, else at the present one
             start = self.model.solve(at.moduli, at.coefficients).displacement

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -73,11 +74,12 @@ class ReducedBasis:
         """Moduli (n_regions,) kPa where it was last made exact with its derivatives."""
         return None if self.place is None or self.place.directions is None else self.place.moduli
 
-    def update(self, at: LinearisationPoint) -> ReducedBasis:
+    def update(self, at: LinearisationPoint, others: Sequence[ReducedBasis] = ()) -> ReducedBasis:
         """Add what the reduced model misses at a place: of the displacement there, and of its derivatives.
 
         Both are corrections by conjugate gradients with the factorisation that is there, from the reduced answers on;
-        where it is none, or the moduli are far from its own, with a new one. The derivatives, sought together with the
+        where it is none, or the moduli are far from its own, with a new one, which other states of the body share. The
+        derivatives, sought together with the
         displacement, are those of the reduced one, and of what it missed where that is no small share. Raises
         `SolverError`.
         """
@@ -88,8 +90,9 @@ class ReducedBasis:
         far = FAR if at.directions is not None else FAR_ALONE
         # a solver that iterates is no preconditioner; for many right-hand sides a new factorisation pays
         if many or not direct or ratios.max() >= far * ratios.min():
-            near = model.system(at.moduli)
-            sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=1))
+            there = [other.system for other in others if other.serves(model, at.moduli)]
+            near = there[0].of(model) if there else model.system(at.moduli)
+            sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=int(not there)))
         displacement, along = self._homogeneous(at), _Directions.at(at, model, every=every)
         product = partial(model.free_forces, at.moduli)
         new = int(not at.same_as(self.place))  # whether the displacement is solved for, too
@@ -114,6 +117,10 @@ class ReducedBasis:
             sharper = sharper.with_material(responses, at.moduli if every else self.material_at)
             sharper = _extended(replace(sharper, place=at), missing[:, :last], cost)
         return sharper
+
+    def serves(self, model: LinearModel, moduli: NDArray[np.float64]) -> bool:
+        """Whether its last factorisation is that of another state's model at moduli (n_regions,) kPa."""
+        return model.same_stiffness(self.full_model) and np.array_equal(self.system.moduli, moduli)
 
     @property
     def error_counts(self) -> SolveCounts:

@@ -180,7 +180,7 @@ class FrozenPosterior:
             score[own] += state.transposed_times(force[:, None], amplitude_slopes, modulus_slopes)[:, 0]
             halfway = state.transposed_times(state.form, amplitude_slopes, modulus_slopes)
             matrix[np.ix_(own, own)] += state.transposed_times(halfway.T, amplitude_slopes, modulus_slopes)
-        return Evaluation(value, misfit, score, matrix, (), self.prior, pull)
+        return Evaluation(value, misfit, score, matrix, (), self.prior, pull, parameters.images)
 
 
 def frozen_posterior(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import linalg, optimize
 
 from palpate.approximation.contract import determined
+from palpate.inversion.by_image import among, shared_by, solve_by_image
 from palpate.inversion.objective import AS_GOOD, Evaluation, Linearisation, Objective, worse_driver
 from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
@@ -61,7 +62,9 @@ def with_scales(objective: Objective, evaluation: Evaluation) -> Objective:
     matrix = evaluation.matrix - evaluation.prior + objective.as_normal(evaluation)[0]
     seen = np.flatnonzero(np.diag(matrix) > 0.0)
     with determined():
-        inverse[np.ix_(seen, seen)] = np.linalg.inv(matrix[np.ix_(seen, seen)])
+        within = np.ix_(seen, seen)
+        images = among(evaluation.images, np.diag(matrix) > 0.0)
+        inverse[within] = solve_by_image(matrix[within], np.eye(len(seen)), images)
     for own, telling in of_one_noise(evaluation).values():
         pooled = _scale([linearisations[i] for i in telling], inverse, 0.0)
         apart = [i for i in own if i not in telling]
@@ -190,17 +193,17 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     """
     parameters, n = objective.parameters, objective.n_parameters
     chosen = list(objective.chosen or (None,) * len(parameters.blocks))
-    model, prior = normal_model(parameters, evaluation, unknowns), evaluation.prior.copy()
+    model = normal_model(parameters, evaluation, unknowns)
 
     def choice(i: int) -> tuple[float, int, Belief]:
         """The gain of a block's best alternative, the number of the one it takes, and that one's covariance."""
-        block, beliefs = parameters.blocks[i], model.beliefs(i, chosen, prior)
+        block, beliefs = parameters.blocks[i], model.beliefs(i, chosen)
         best = max(range(len(beliefs)), key=lambda k: beliefs[k].evidence)
         present = chosen[i] if chosen[i] in range(len(beliefs)) else None
         if present is None and block.acts is Acts.MATERIAL:
             present = 0
         if present is None and objective.learn_last and block.slight and best == 1:
-            beliefs, present = model.beliefs_beside(i, chosen, prior)[:2], 0
+            beliefs, present = model.beliefs_beside(i, chosen)[:2], 0
         if present is None:
             return np.inf, best, beliefs[best]
         gain = beliefs[best].evidence - beliefs[present].evidence
@@ -215,8 +218,8 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
             i = max(waiting, key=lambda k: choices[k][0])
             waiting.remove(i)
             _, chosen[i], taken = choices[i]
-            prior = model.believed(i, taken.covariance, prior)
-    parameters = replace(parameters, nuisance_precision=prior[n:, n:])
+            model = model.believing(i, taken.covariance)
+    parameters = replace(parameters, nuisance_precision=model.prior[n:, n:])
     return replace(objective, parameters=parameters, chosen=tuple(chosen))
 
 
@@ -233,12 +236,13 @@ def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[n
         return objective
     prior, centre = parameters.prior_matrix, parameters.prior_centre
     model = normal_model(parameters, evaluation, unknowns)
+    of_data = model.pull - model.prior @ centre
     for i in numbers:
         columns, variation = parameters.columns(i), parameters.blocks[i].variation
         assert variation is not None
         centre[columns] = 0.0
         with determined():
-            seen = _schur_complement(model.data + prior, model.data, model.pull + prior @ centre, columns)
+            seen = _schur_complement(prior, model.data, of_data + prior @ centre, columns)
             x = variation.least(*seen, unknowns[columns])
             prior[np.ix_(columns, columns)] = curvature = variation.curvature(x)
             away = linalg.solve(curvature, variation.gradient(x), assume_a="pos")
@@ -255,9 +259,11 @@ def _admissible(blocks: Sequence[Block], number: int, chosen: Sequence[int | Non
 
 
 def normal_model(parameters: ParameterMap, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> NormalModel:
-    """That of residuals which are linear around unknowns (n,), where they were evaluated."""
-    data = evaluation.matrix - evaluation.prior
-    return NormalModel(parameters, data, data @ unknowns - (evaluation.score - evaluation.prior_score))
+    """That of residuals which are linear around unknowns (n,), where they were evaluated, under the prior there."""
+    data, prior = evaluation.matrix - evaluation.prior, evaluation.prior
+    pull = data @ unknowns - (evaluation.score - evaluation.prior_score) + prior @ parameters.prior_centre
+    model = NormalModel(parameters, data, pull, prior, ())
+    return replace(model, followed=tuple(model.what_follows(own) for own in parameters.images))
 
 
 class Belief(NamedTuple):
@@ -269,58 +275,105 @@ class Belief(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class NormalModel:
-    """Linear residuals: the information A = J^T W J of all unknowns, `data` (n, n), and the pull A x - J^T W r (n,)."""
+    """Linear residuals under a normal prior, of which the images' own unknowns may follow the others.
+
+    data (n, n): the information A = J^T W J of all unknowns; pull (n,): A x - J^T W r + P m; prior (n, n): P; followed:
+    of each of several images what its own unknowns y take from information and pull of those that all share,
+    A_sy (A + P)_yy^-1 A_ys (n_shared, n_shared) and A_sy (A + P)_yy^-1 b_y (n_shared,).
+    """
 
     parameters: ParameterMap
     data: NDArray[np.float64]
     pull: NDArray[np.float64]
+    prior: NDArray[np.float64]
+    followed: tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...]
 
-    def beliefs(self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]) -> list[Belief]:
-        """Those of block i that the alternatives `chosen` for the others leave it, others under a prior (n, n)."""
-        block, columns = _admissible(self.parameters.blocks, i, chosen), self.parameters.columns(i)
-        pull, odds = self.pull + prior @ self.parameters.prior_centre, block.odds or (0.0,) * len(block.alternatives)
+    def beliefs(self, i: int, chosen: Sequence[int | None]) -> list[Belief]:
+        """Those of block i that the alternatives `chosen` for the others leave it."""
+        block, odds = _admissible(self.parameters.blocks, i, chosen), self.parameters.blocks[i].odds
+        odds = odds or (0.0,) * len(block.alternatives)
         with determined():
-            seen = _Whitened.of(*_schur_complement(self.data + prior, self.data, pull, columns))
-            return [_most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=True)]
+            seen = _Whitened.of(*self._seen(i))
+        return [_most_evident(terms, seen, block, odd) for terms, odd in zip(block.alternatives, odds, strict=False)]
 
-    def beliefs_beside(self, i: int, chosen: Sequence[int | None], prior: NDArray[np.float64]) -> list[Belief]:
+    def beliefs_beside(self, i: int, chosen: Sequence[int | None]) -> list[Belief]:
         """The same, each with what its rivals gain beside it by more than what is as good, over their first ones."""
-        found, cause = list[Belief](), self.parameters.blocks[i].cause
+        found, cause, model = list[Belief](), self.parameters.blocks[i].cause, self
         rivals = [j for j, block in enumerate(self.parameters.blocks) if cause in block.rivals]
         for j in rivals:
-            prior = self.believed(j, self.parameters.blocks[j].alternatives[0][0], prior)
-        for k, own in enumerate(self.beliefs(i, chosen, prior)):
-            beside, among = self.believed(i, own.covariance, prior), [*chosen[:i], k, *chosen[i + 1 :]]
-            evidences = [[of.evidence for of in self.beliefs(j, among, beside)] for j in rivals]
+            model = model.believing(j, self.parameters.blocks[j].alternatives[0][0])
+        for k, own in enumerate(model.beliefs(i, chosen)):
+            beside, among_them = model.believing(i, own.covariance), [*chosen[:i], k, *chosen[i + 1 :]]
+            evidences = [[of.evidence for of in beside.beliefs(j, among_them)] for j in rivals]
             gains = [max(of) - of[0] for of in evidences]
             found.append(own._replace(evidence=own.evidence + sum(gain for gain in gains if gain > AS_GOOD)))
         return found
 
-    def believed(self, i: int, covariance: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A prior (n, n) with another covariance (m, m) of block i."""
-        columns, found = self.parameters.columns(i), prior.copy()
+    def believing(self, i: int, covariance: NDArray[np.float64]) -> NormalModel:
+        """The same under a prior with another covariance (m, m) of block i."""
+        columns, prior, followed = self.parameters.columns(i), self.prior.copy(), list(self.followed)
         with determined():
-            found[np.ix_(columns, columns)] = linalg.inv(covariance)
-        return found
+            prior[np.ix_(columns, columns)] = linalg.inv(covariance)
+        change = prior[columns] - self.prior[columns]
+        pull = self.pull.copy()
+        pull[columns] += change @ self.parameters.prior_centre
+        model = replace(self, prior=prior, pull=pull)
+        for k, own in enumerate(self.parameters.images):
+            if columns[0] in own:
+                followed[k] = model.what_follows(own)
+        return replace(model, followed=tuple(followed))
+
+    def what_follows(self, own: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What an image's own unknowns (m,) take from information and pull of those that all share (see above)."""
+        shared = shared_by(self.parameters.images, len(self.pull))
+        across = self.data[np.ix_(own, shared)]
+        with determined():
+            answer = _following(self.data, self.prior, own, np.column_stack([across, self.pull[own]]))
+        taken = across.T @ answer
+        return taken[:, :-1], taken[:, -1]
+
+    def _seen(self, i: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What the data say of block i when all else follows (see `_schur_complement`), image by image."""
+        columns, images = self.parameters.columns(i), self.parameters.images
+        if not images:
+            return _schur_complement(self.prior, self.data, self.pull, columns)
+        shared = shared_by(images, len(self.pull))
+        mine = [k for k, own in enumerate(images) if columns[0] in own]
+        others = [taken for k, taken in enumerate(self.followed) if k not in mine]
+        numbers = np.concatenate([shared, *(images[k] for k in mine)])
+        within, n = np.ix_(numbers, numbers), len(shared)
+        data, pull = self.data[within], self.pull[numbers]
+        for information, of_pull in others:
+            data[:n, :n] -= information
+            pull[:n] -= of_pull
+        place = np.flatnonzero(np.isin(numbers, columns))
+        return _schur_complement(self.prior[within], data, pull, place)
 
 
 def _schur_complement(
-    matrix: NDArray[np.float64], data: NDArray[np.float64], pull: NDArray[np.float64], columns: NDArray[np.int64]
+    prior: NDArray[np.float64], data: NDArray[np.float64], pull: NDArray[np.float64], columns: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """What data say of k unknowns `columns` when all else follows: information A (k, k), pull b = A x - J^T W r (k,).
 
-    The Schur complement of the information `data`, the others under their prior; matrix (n, n): the data's and the
-    prior's; pull (n,): likewise, with the prior's mean.
+    The Schur complement of the information `data` (n, n), the others under their `prior` (n, n), whose mean is in the
+    pull (n,).
     """
     rest = np.setdiff1d(np.arange(len(pull)), columns)
     across = data[np.ix_(rest, columns)]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix)[rest], 1e-30))
-    scaled = scale[:, None] * matrix[np.ix_(rest, rest)] * scale
-    scaled[np.diag_indices_from(scaled)] += 1e-10  # a modulus that moves nothing
-    right = scale[:, None] * np.column_stack([across, pull[rest]])
-    followed = across.T @ (scale[:, None] * linalg.solve(scaled, right, assume_a="pos", check_finite=False))
+    followed = across.T @ _following(data, prior, rest, np.column_stack([across, pull[rest]]))
     information = data[np.ix_(columns, columns)] - followed[:, :-1]
     return 0.5 * (information + information.T), pull[columns] - followed[:, -1]
+
+
+def _following(
+    data: NDArray[np.float64], prior: NDArray[np.float64], own: NDArray[np.int64], right: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(A + P)^-1 b (m, k) of some unknowns `own` (m,) with the information and the prior (n, n), b (m, k)."""
+    matrix = data[np.ix_(own, own)] + prior[np.ix_(own, own)]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))[:, None]
+    scaled = scale * matrix * scale.T
+    scaled[np.diag_indices_from(scaled)] += 1e-10  # a modulus that moves nothing
+    return np.asarray(scale * linalg.solve(scaled, scale * right, assume_a="pos", check_finite=False))
 
 
 def _most_evident(terms: Sequence[NDArray[np.float64]], seen: _Whitened, block: Block, odds: float) -> Belief:

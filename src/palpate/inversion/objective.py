@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.approximation.contract import Approximation, LinearisationPoint, determined
+from palpate.inversion.by_image import Images, among, log_determinant, solve_by_image
 from palpate.inversion.later_state import LaterState
 from palpate.mechanics.forward import Equilibrium
 from palpate.observation.contract import Observation, OfMaterial, Rematched, Residuals
@@ -98,7 +99,7 @@ class Evaluation:
 
     matrix (n, n) = J^T W J + P and score (n,) = J^T W r + P (x - m) with the Jacobians J of smooth surfaces: the
     estimate is where the score vanishes. prior (n, n): P, the precision of the unknowns before the images are seen;
-    prior_score (n,): its part of the score.
+    prior_score (n,): its part of the score. images: the unknowns that belong to each of several images alone.
     """
 
     value: float
@@ -108,6 +109,7 @@ class Evaluation:
     linearisations: tuple[Linearisation, ...]
     prior: NDArray[np.float64]
     prior_score: NDArray[np.float64]
+    images: Images = ()
 
     def covariance_columns(self, n_parameters: int) -> NDArray[np.float64]:
         """H^-1 [e_1, ..., e_k] (n, k) of the first k unknowns, the log-moduli, with the Gauss-Newton matrix H.
@@ -115,7 +117,13 @@ class Evaluation:
         Raises `EstimationError` where neither images nor prior determine some unknown.
         """
         with determined():
-            return np.asarray(np.linalg.solve(self.matrix, np.eye(len(self.matrix))[:, :n_parameters]))
+            return solve_by_image(self.matrix, np.eye(len(self.matrix))[:, :n_parameters], self.images)
+
+    def of_those(self, kept: NDArray[np.bool_]) -> Evaluation:
+        """The same matrix and score of the unknowns that are `kept` (n,) alone, without residuals."""
+        within, images = np.ix_(kept, kept), among(self.images, kept)
+        own = (self.score[kept], self.matrix[within], (), self.prior[within], self.prior_score[kept])
+        return Evaluation(self.value, self.misfit_mm2, *own, images)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +160,9 @@ class Objective:
             residuals += sum(worse_driver(o.weighting.sd, kinds[o.kind]) for o in drivers)
         normal, beyond = self.as_normal(evaluation)
         n = self.n_parameters
-        determinants = log_det(evaluation.matrix - evaluation.prior + normal) - log_det(normal[n:, n:])
+        images = self.parameters.images
+        posterior = log_det(evaluation.matrix - evaluation.prior + normal, images)
+        determinants = posterior - log_det(normal[n:, n:], tuple(own - n for own in images))
         return evaluation.value + (residuals + beyond - sum(odds) + 0.5 * determinants)
 
     def as_normal(self, evaluation: Evaluation) -> tuple[NDArray[np.float64], float]:
@@ -268,7 +278,7 @@ class Objective:
             loss = float(term.residuals.weights @ term.observation.weighting.loss.rho(term.residuals.values))
             misfit += loss / len(linearisations)
             value += 0.5 * term.precision * loss
-        return Evaluation(value, misfit, score, matrix, tuple(linearisations), prior, pull)
+        return Evaluation(value, misfit, score, matrix, tuple(linearisations), prior, pull, self.parameters.images)
 
     def rematched(self, unknowns: NDArray[np.float64]) -> Objective:
         """The same with what belongs together in model and image chosen anew at unknowns (n_unknowns,).
@@ -398,10 +408,10 @@ def worse_driver(sd: float, kind_sd: float) -> float:
     return 0.5 * (max(float(np.log(sd / kind_sd)), 0.0) / DRIVER_LN_SD) ** 2
 
 
-def log_det(matrix: NDArray[np.float64]) -> float:
+def log_det(matrix: NDArray[np.float64], images: Images = ()) -> float:
     """Ln det of a positive definite matrix (n, n), without the unknowns that nothing depends on."""
     seen = np.diag(matrix) > 0.0
-    return float(np.linalg.slogdet(matrix[np.ix_(seen, seen)])[1]) if seen.any() else 0.0
+    return log_determinant(matrix[np.ix_(seen, seen)], among(images, seen)) if seen.any() else 0.0
 
 
 def _prior(parameters: ParameterMap, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import SolverError
+from palpate.inversion.by_image import Images, solve_by_image
 from palpate.inversion.objective import Evaluation
 
 RADIUS = 2.0  # largest trust radius of the log-moduli; the first one is half of it
@@ -141,7 +142,7 @@ def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
     evaluation, sd = minimum.evaluation, np.full(n_parameters, np.inf)
     seen = np.diag(evaluation.matrix) > 0.0
     kept = seen[:n_parameters]
-    own = evaluation if seen.all() else replace(evaluation, matrix=evaluation.matrix[np.ix_(seen, seen)])
+    own = evaluation if seen.all() else evaluation.of_those(seen)
     sd[kept] = np.sqrt(np.diag(own.covariance_columns(int(kept.sum()))))
     return sd
 
@@ -256,7 +257,7 @@ def newton_step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> 
 
 def newton_decrement(now: Evaluation) -> float:
     """s^T H^-1 s / 2 of score s and Gauss-Newton matrix H: what a step of all unknowns still promises."""
-    return float(0.5 * now.score @ _solve(now.matrix, now.score[:, None])[:, 0])
+    return float(0.5 * now.score @ _solve(now.matrix, now.score[:, None], now.images)[:, 0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,8 +284,10 @@ class _QuadraticModel:
         moduli = np.flatnonzero(free[:n_parameters])
         matrix = now.matrix + damping * np.diag(np.diag(now.matrix))
         side, own = matrix[n_parameters:, moduli], matrix[np.ix_(moduli, moduli)]
-        solved = _solve(matrix[n_parameters:, n_parameters:], np.column_stack([side, now.score[n_parameters:]]))
-        slopes, rest = solved[:, :-1], solved[:, -1]
+        images = tuple(numbers - n_parameters for numbers in now.images)
+        right = np.column_stack([side, now.score[n_parameters:]])
+        followed = _solve(matrix[n_parameters:, n_parameters:], right, images)
+        slopes, rest = followed[:, :-1], followed[:, -1]
         diagonal = np.diag(now.matrix)[moduli]
         return cls(free, own - side.T @ slopes, now.score[moduli] - side.T @ rest, diagonal, slopes, rest)
 
@@ -300,12 +303,12 @@ class _QuadraticModel:
         return step
 
 
-def _solve(matrix: NDArray[np.float64], rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Solve a positive semi-definite system (n, n) scaled to a unit diagonal for rhs (n, k).
+def _solve(matrix: NDArray[np.float64], rhs: NDArray[np.float64], images: Images = ()) -> NDArray[np.float64]:
+    """Solve a positive semi-definite system (n, n) scaled to a unit diagonal for rhs (n, k), image by image.
 
     A ridge of 1e-12 prevents a singular matrix.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))[:, None]
     scaled = scale * matrix * scale.T
     scaled[np.diag_indices_from(scaled)] += 1e-12
-    return np.asarray(scale * np.linalg.solve(scaled, scale * rhs))
+    return np.asarray(scale * solve_by_image(scaled, scale * rhs, images))

@@ -106,8 +106,7 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
         return begun(start, begin)
     for number, state in enumerate(start.states, start=1):
         progress(f"responses of the full model in the middle of the bounds, state {number} of {len(start.states)}")
-        system = state.model.system(parameters.moduli(begin))
-        found.append(_Responses(system, system.single_responses(tolerance=SNAPSHOT)))
+        found.append(_responses(state.model, parameters.moduli(begin), found))
         states.append(replace(state, observed=found[-1].seen(state, np.zeros(state.model.n_modes))))
     progress("the motion of the walls and of the frame at these moduli")
     objective = replace(start, states=tuple(states)).rematched(begin)
@@ -143,18 +142,39 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
     return begun(Objective(tuple(informed), seen), unknowns, evaluations=evaluations)
 
 
+def _responses(model: LinearModel, moduli: NDArray[np.float64], others: Sequence[_Responses]) -> _Responses:
+    """Those of a state's model at moduli (n_regions,) kPa; `others`: of the states before.
+
+    States of one body with the same modes differ in offset and loads alone: one right-hand side.
+    """
+    for other in others:
+        like = other.system.model
+        if model.same_stiffness(like) and model.constraint.modes is like.constraint.modes:
+            system = other.system.of(model)
+            alone = system.solve(np.zeros(model.n_modes)).values.astype(np.float32)
+            return _Responses(system, other.boundary, alone, SolveCounts(forward=1))
+    system = model.system(moduli)
+    responses = system.single_responses(tolerance=SNAPSHOT)
+    return _Responses(system, responses[:, :-1], responses[:, -1], system.response_counts)
+
+
 @dataclass(frozen=True, slots=True)
 class _Responses:
-    """A system with the responses (n_dof, n_boundary + 1) and (n_dof, n_material) mm of its model to all modes."""
+    """A system with the responses (n_dof, n_boundary) and (n_dof, n_material) mm of its model to all modes.
+
+    alone (n_dof,) mm: to offset and loads; cost: of the former.
+    """
 
     system: LinearSystem
     boundary: NDArray[np.float32]
+    alone: NDArray[np.float32]
+    cost: SolveCounts
     material: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32))
 
     def with_material(self, coefficients: NDArray[np.float64]) -> _Responses:
         """The same with responses to the material modes, at coefficients (n_modes,) of homogeneous tissues."""
-        q = coefficients[: self.boundary.shape[1] - 1]
-        values = np.asarray(self.boundary @ np.append(q, 1.0).astype(np.float32), dtype=np.float64)
+        q = coefficients[: self.boundary.shape[1]].astype(np.float32)
+        values = np.asarray(self.boundary @ q + self.alone, dtype=np.float64)
         material = self.system.material_responses(values, tolerance=SNAPSHOT, dtype=np.float32)
         return replace(self, material=material)
 
@@ -162,21 +182,23 @@ class _Responses:
         """The observed part of the responses, to first order around coefficients (n_modes,), at fixed moduli."""
         model, moduli = self.system.model, self.system.moduli
         by_boundary = state.seen(self.boundary).astype(np.float64)
+        alone = state.seen(self.alone).astype(np.float64)
         by_material = np.zeros((len(by_boundary), model.material.n_modes))
         by_material[:, : self.material.shape[1]] = state.seen(self.material) if self.material.size else 0.0
-        tangent = np.concatenate([np.zeros((len(by_boundary), len(moduli))), by_boundary[:, :-1], by_material], axis=1)
-        values = by_boundary[:, -1] + tangent[:, len(moduli) :] @ coefficients
+        tangent = np.concatenate([np.zeros((len(by_boundary), len(moduli))), by_boundary, by_material], axis=1)
+        values = alone + tangent[:, len(moduli) :] @ coefficients
         return FirstOrderModel(model.names, moduli, coefficients, values, tangent)
 
     def combined(
         self, model: LinearModel, boundary: NDArray[np.float64], material: NDArray[np.float64]
     ) -> ReducedBasis:
         """The reduced basis of combinations (n_boundary, k) and (n_material, l), of which `model` is made."""
-        own = np.eye(1, int(np.any(self.boundary[:, -1])))  # that of offset and loads, where there are any
-        every = linalg.block_diag(boundary, own).astype(np.float32)
-        cost = self.system.response_counts + SolveCounts(tangent=self.material.shape[1])
-        snapshots = free_combinations(model, self.boundary, every)
-        basis = basis_of(replace(self.system, model=model), snapshots, cost)
+        cost = self.cost + SolveCounts(tangent=self.material.shape[1])
+        snapshots = free_combinations(model, self.boundary, boundary.astype(np.float32))
+        if np.any(self.alone):
+            own = np.asarray(model.constraint.free.T @ self.alone, dtype=np.float64)
+            snapshots = np.column_stack([snapshots, own])
+        basis = basis_of(self.system.of(model), snapshots, cost)
         responses = np.asarray(self.material @ material.astype(np.float32), dtype=np.float64)
         return basis.with_material(responses, self.system.moduli)
 

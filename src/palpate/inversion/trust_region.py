@@ -12,7 +12,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.approximation.contract import Approximation, ModelError
+from palpate.approximation.contract import Approximation, ModelError, updated
 from palpate.approximation.expansion import Expansion
 from palpate.errors import NotConverged
 from palpate.inversion.frozen_posterior import cheapest_minima
@@ -428,8 +428,7 @@ def _evaluated(step: _Step, now: OuterIterate, bounds: Bounds, rule: StopRule) -
     exact = max(missing, left) >= 1.0
     if exact:
         points = objective.linearisation_points(unknowns, minimum.evaluation, all_material=rule.all_material)
-        pairs = zip(objective.approximations, points, strict=True)
-        objective = objective.under([approximation.update(point) for approximation, point in pairs])
+        objective = objective.under(updated(objective.approximations, points))
         minimum, spent = replace(minimum, evaluation=objective(unknowns)), spent + 1
     steps, across = step.remaining(before.unknowns, minimum.evaluation, bounds)
     tolerance = rule.tolerance(minimum, n)

@@ -87,6 +87,10 @@ class LinearModel:
         coupling = tuple(sparse.csr_matrix(constraint.free.T @ (matrix @ given)) for matrix in self.stiffness)
         return replace(self, conditions=conditions, coupling=coupling)
 
+    def same_stiffness(self, other: LinearModel) -> bool:
+        """Whether it is the same body with the same free displacements, so that one factorisation serves both."""
+        return self.free_stiffness is other.free_stiffness
+
     @property
     def load(self) -> NDArray[np.float64]:
         """Nodal forces f (n_dof,) of all loads, mN."""
@@ -212,6 +216,10 @@ class LinearSystem:
     model: LinearModel
     moduli: NDArray[np.float64]
     factorisation: Factorisation
+
+    def of(self, model: LinearModel) -> LinearSystem:
+        """The system of another state of the same body, with the factorisation that is there."""
+        return replace(self, model=model)
 
     @property
     def response_counts(self) -> SolveCounts:

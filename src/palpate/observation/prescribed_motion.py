@@ -70,15 +70,11 @@ def prescribed_motion(
     A point that a driver and a bone share follows the bone. Each driver has its own `n_modes` modes (see
     `wall_modes` for kernel_mm and prior_mm, mm).
     """
-    n = len(space.points)
-    offset, prescribed = np.zeros((n, 3)), np.zeros(n, dtype=bool)
+    n, prescribed = len(space.points), np.zeros(len(space.points), dtype=bool)
     blocks, walls = list[NDArray[np.float64]](), list[Wall]()
     roles = [tissue.role for tissue in space.mesh.tissues]
-    for tissue in (i for i, role in enumerate(roles) if role is Role.RIGID):
-        points = np.unique(space.facets(tissue_surface(space.mesh, tissue).triangles))
+    for points in _rigid_points(space).values():
         prescribed[points] = True
-        if tissue in bones:
-            offset[points] = bones[tissue].apply(space.points[points]) - space.points[points]
     held = prescribed.copy()
     for tissue in (i for i, role in enumerate(roles) if role is Role.DRIVER):
         triangles = tissue_surface(space.mesh, tissue).triangles
@@ -115,9 +111,24 @@ def prescribed_motion(
         n_rigid = rigid.shape[1]
         prescribed[points] = True
     modes = np.concatenate(blocks, axis=1) if blocks else np.zeros((3 * n, 0))
-    return PrescribedMotion(
-        modes, offset.ravel(), prescribed, tuple(walls), covariances, n_rigid, frame.motion_mm if frame else 1.0
-    )
+    smooth_mm = frame.motion_mm if frame else 1.0
+    offset = bone_offset(space, bones)
+    return PrescribedMotion(modes, offset, prescribed, tuple(walls), covariances, n_rigid, smooth_mm)
+
+
+def bone_offset(space: LagrangeSpace, bones: Mapping[int, Motion]) -> NDArray[np.float64]:
+    """Displacement (3 n_points,) mm of the points of every rigid tissue, by index in `bones`; 0 elsewhere."""
+    offset = np.zeros((len(space.points), 3))
+    for tissue, points in _rigid_points(space).items():
+        if tissue in bones:
+            offset[points] = bones[tissue].apply(space.points[points]) - space.points[points]
+    return offset.ravel()
+
+
+def _rigid_points(space: LagrangeSpace) -> dict[int, NDArray[np.int64]]:
+    """Numbers of the points of each rigid tissue's surface, by the tissue's index; of two that meet the last wins."""
+    rigid = [i for i, tissue in enumerate(space.mesh.tissues) if tissue.role is Role.RIGID]
+    return {i: np.unique(space.facets(tissue_surface(space.mesh, i).triangles)) for i in rigid}
 
 
 def _among(points: NDArray[np.int64], n: int, local: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -29,7 +29,7 @@ from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import Imaged, ImagedBody, Observation, OfInstrument
 from palpate.observation.noise_model import NoiseModel
-from palpate.observation.prescribed_motion import FrameMotion, PrescribedMotion, prescribed_motion
+from palpate.observation.prescribed_motion import FrameMotion, PrescribedMotion, bone_offset, prescribed_motion
 from palpate.observation.registry import observations
 from palpate.progress import Line, Progress, grouped
 from palpate.study.case import Case
@@ -263,6 +263,13 @@ def _models(body: Body, case: Case, first: int) -> list[tuple[LinearModel, Presc
     frame = FrameMotion(domain.outer_motion_mm, domain.outer_kernel_mm) if moving else None
     dilatation, layered = choose_element(case.mechanics.element).dilatation, body.layered
     for state, bones in enumerate(body.states.bones, start=first + 1):
+        loads = case_loads(case, body.space, state)
+        if models:  # the same walls and frame, which move otherwise
+            model, motion = models[0]
+            motion = replace(motion, offset=bone_offset(body.space, bones))
+            constraint = replace(model.constraint, offset=motion.offset)
+            models.append((model.under(Conditions(constraint, loads)), motion))
+            continue
         motion = prescribed_motion(
             body.space,
             bones,
@@ -279,19 +286,14 @@ def _models(body: Body, case: Case, first: int) -> list[tuple[LinearModel, Presc
             offset=motion.offset,
             prescribed=motion.prescribed,
         )
-        loads = case_loads(case, body.space, state)
-        made = (
-            models[0][0].under(Conditions(constraint, loads))
-            if models
-            else linear_model(
-                layered,
-                constraint,
-                dilatation=dilatation,
-                loads=loads,
-                solver=case.mechanics.solver,
-                open_poisson=_open_poisson(case, body.space.mesh),
-                material=_material(body.space.mesh, body.layers, case),
-            )
+        made = linear_model(
+            layered,
+            constraint,
+            dilatation=dilatation,
+            loads=loads,
+            solver=case.mechanics.solver,
+            open_poisson=_open_poisson(case, body.space.mesh),
+            material=_material(body.space.mesh, body.layers, case),
         )
         models.append((made, motion))
     return models

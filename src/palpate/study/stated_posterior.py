@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation.contract import updated
 from palpate.errors import SolverError
 from palpate.inversion import Bounds, FrozenPosterior, Inversion, Minimum, Objective, frozen_posterior
 from palpate.parallel import mapped
@@ -73,7 +74,7 @@ def exact_at_ends(posterior: StatedPosterior, objective: Objective, bounds: Boun
             asked.append(objective.linearisation_points(least.unknowns, least.evaluation, all_material=False))
         try:
             for points in asked:
-                models = [model.update(at) for model, at in zip(models, points, strict=True)]
+                models = updated(models, points)
         except SolverError:
             break
         exact = frozen_posterior(objective.bent_as(models), least.unknowns)

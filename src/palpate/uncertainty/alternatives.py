@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from palpate.approximation.contract import determined
-from palpate.inversion.hyper_parameters import normal_model
+from palpate.inversion.by_image import solve_by_image
+from palpate.inversion.hyper_parameters import NormalModel, normal_model
 from palpate.inversion.objective import Evaluation, Objective
 
 
@@ -21,24 +21,24 @@ def undecided_covariance(
     of the log-moduli under each, and how far d_k it moves them, with the residuals linear around unknowns (n_unknowns,)
     (law of total variance).
     """
-    parameters, n, prior = objective.parameters, objective.n_parameters, evaluation.prior
+    parameters, n = objective.parameters, objective.n_parameters
     model = normal_model(parameters, evaluation, unknowns)
 
-    def posterior(of: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Mean (n,) and covariance (n, n) of the log-moduli under a prior's precision."""
-        right = np.column_stack([np.eye(len(of))[:, :n], model.pull + of @ parameters.prior_centre])
-        solved = linalg.solve(model.data + of, right, assume_a="pos", check_finite=False)
-        return solved[:n, n], solved[:n, :n]
+    def posterior(of: NormalModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Mean (n,) and covariance (n, n) of the log-moduli under a prior."""
+        right = np.column_stack([np.eye(len(of.pull))[:, :n], of.pull])
+        found = solve_by_image(of.data + of.prior, right, evaluation.images)
+        return found[:n, n], found[:n, :n]
 
     found = dict[str, NDArray[np.float64]]()
     numbers = objective.chosen or (None,) * len(parameters.blocks)
     with determined():
-        mean, covariance = posterior(prior)
+        mean, covariance = posterior(model)
         for i in range(len(parameters.blocks)):
             block, chosen = parameters.blocks[i], numbers[i] or 0
             if not block.odds:
                 continue
-            beliefs = model.beliefs(i, numbers, prior)
+            beliefs = model.beliefs(i, numbers)
             evidences = np.array([belief.evidence for belief in beliefs])
             shares = np.exp(evidences - evidences.max())
             shares /= shares.sum()
@@ -46,7 +46,7 @@ def undecided_covariance(
             for k, belief in enumerate(beliefs):
                 if k == chosen:
                     continue
-                moved, spread = posterior(model.believed(i, belief.covariance, prior))
+                moved, spread = posterior(model.believing(i, belief.covariance))
                 part += shares[k] * (spread - covariance + np.outer(moved - mean, moved - mean))
             sizes, axes = np.linalg.eigh(part)  # an alternative that knows more makes nothing narrower
             found[block.cause] = found.get(block.cause, np.zeros((n, n))) + (axes * np.maximum(sizes, 0.0)) @ axes.T

@@ -13,6 +13,7 @@ from scipy import sparse
 from palpate.images.distance import cropped, window_of
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
+from palpate.inversion.by_image import among
 from palpate.inversion.hyper_parameters import of_one_noise
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.mesh.space import LagrangeSpace
@@ -188,6 +189,7 @@ def _given_model(objective: Objective, evaluation: Evaluation) -> Evaluation:
         linearisations=tuple(linearisations),
         prior=evaluation.prior[within],
         prior_score=evaluation.prior_score[own],
+        images=among(evaluation.images, np.isin(np.arange(parameters.n_unknowns), own)),
     )
 
 

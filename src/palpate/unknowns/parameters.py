@@ -62,7 +62,8 @@ class _Layout:
     """Where the unknowns of blocks stand among all: of each block (n,), and by how they act in which state (n,).
 
     on_moduli (n,): those that act on moduli, in every later state; shares (n,): theirs; of_regions (n_regions, n): 1
-    where such an unknown is one of a region.
+    where such an unknown is one of a region; images: of each later state those that act in it alone, () where fewer
+    than two states have any.
     """
 
     blocks: tuple[NDArray[np.int64], ...]
@@ -70,6 +71,7 @@ class _Layout:
     on_moduli: NDArray[np.int64]
     shares: NDArray[np.float64]
     of_regions: NDArray[np.float64]
+    images: tuple[NDArray[np.int64], ...]
 
     @classmethod
     def of(cls, blocks: Sequence[Block], first: int, n_regions: int) -> _Layout:
@@ -84,6 +86,8 @@ class _Layout:
         pairs, states = list(zip(blocks, places, strict=True)), {state for block in blocks for state in block.states}
         acting = {(a, k): joint([p for b, p in pairs if b.acts is a and k in b.states]) for a in Acts for k in states}
         own = [block for block in blocks if block.acts is Acts.MODULI]
+        of_one = [joint([place for block, place in pairs if block.states == (k,)]) for k in sorted(states)]
+        images = tuple(numbers for numbers in of_one if len(numbers))
         of_regions = [np.isin(np.arange(n_regions), block.regions) for block in own]
         return cls(
             places,
@@ -91,6 +95,7 @@ class _Layout:
             joint([place for block, place in pairs if block.acts is Acts.MODULI]),
             np.array([block.share for block in own]),
             np.array(of_regions, dtype=np.float64).reshape(len(own), n_regions).T,
+            images if len(images) > 1 else (),
         )
 
 
@@ -197,6 +202,11 @@ class ParameterMap:
     def columns(self, block: int) -> NDArray[np.int64]:
         """Numbers (n,) among all unknowns of those of a block."""
         return self._layout.blocks[block]
+
+    @property
+    def images(self) -> tuple[NDArray[np.int64], ...]:
+        """Numbers (n,) of the unknowns that belong to each later state alone; () where fewer than two have any."""
+        return self._layout.images
 
     def acting(self, acts: Acts, state: int) -> NDArray[np.int64]:
         """Numbers (n,) of the unknowns that act so in a later state, in the order of the blocks."""
