@@ -1,7 +1,7 @@
 """What more later images of one patient are worth, and what they cost.
 
-    python benchmarks/patients.py [--images 1,2,4,8] [--noise 0.15,0.3] [--laws linear] [--patients 4] [--first-seed 901]
-                                  [--cache FOLDER] [--output FILE]
+    python benchmarks/patients.py [--images 1,2,4,8] [--noise 0.15,0.3] [--laws linear] [--patients 4]
+                                  [--first-seed 901] [--cache FOLDER] [--output FILE]
 
 Simulated patients, everything at once: one body, of which every later image shows another filling of the rectum (5 to
 8 mm), a border that moves smoothly by 1 mm, a patient who lies 3 mm and 2 degrees elsewhere, and surfaces with errors
@@ -24,7 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+import palpate
 from palpate.images import write_label_image
 from palpate.mechanics import law_named
 from palpate.mesh import OUTER, LagrangeSpace, lagrange_space, tetrahedralise
@@ -86,7 +88,7 @@ def main() -> int:
 def _run(case: Path) -> dict[str, Any]:
     """The estimate of a case in a process of its own."""
     command = [sys.executable, __file__, "--one", str(case)]
-    said = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, check=False)
+    said = subprocess.run(command, capture_output=True, text=True, check=False)
     if said.returncode:
         return {"status": "failed", "reason": (said.stderr.strip().splitlines() or ["killed"])[-1]}
     return dict(json.loads(said.stdout.splitlines()[-1]))
@@ -94,8 +96,6 @@ def _run(case: Path) -> dict[str, Any]:
 
 def _estimated(path: Path) -> dict[str, Any]:
     """What an estimate finds and takes."""
-    import palpate
-
     began, truth = time.perf_counter(), json.loads((path.parent / "truth.json").read_text())["moduli_kpa"]
     document = palpate.estimate(palpate.read_case(path), truth=truth).document
     spent = resource.getrusage(resource.RUSAGE_SELF)
@@ -168,7 +168,7 @@ def _motion(options: PelvisOptions, number: int, space: LagrangeSpace, rng: np.r
     return BoundaryMotion(walls, ScaledMotion(drawn, BORDER_MM / rms))
 
 
-def _patches(space: LagrangeSpace, rng: np.random.Generator) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _patches(space: LagrangeSpace, rng: np.random.Generator) -> NDArray[np.float64]:
     """Factors of E (n_tets,), in ln: a Gaussian field of its own in every tissue."""
     mesh = space.mesh
     drawn = smooth_field(rng, sd_mm=FIELD_SD, correlation_mm=FIELD_LENGTH_MM).at(mesh.nodes[mesh.tets].mean(axis=1))
