@@ -80,6 +80,19 @@ def test_a_modulus_that_is_identified_stands_in_kilopascals_with_its_range():
     assert "10 kPa for fat" in words_of(found)
 
 
+@pytest.mark.parametrize(
+    ("known", "words"),
+    [
+        (10.0, "10 kPa for fat, the stated loads and the measured forces. If one of these is wrong"),
+        (None, "the stated loads and the measured forces. If the truth is twice that, all double."),
+    ],
+)
+def test_the_loads_and_forces_that_set_the_scale_are_named(known, words):
+    of = document(item("gland", "weak"), known=known)
+    of["case"] |= {"loads": [{"kind": "gravity"}], "data": [{"kind": "force"}]}
+    assert words in words_of(summary(of))
+
+
 def test_a_ratio_alone_is_never_told_in_kilopascals():
     for of in (
         document(item("gland", "ratio only"), known=[4.0, 25.0]),

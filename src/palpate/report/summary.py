@@ -17,7 +17,7 @@ RESEARCH = (
 PASCAL = (
     "Stiffness is given in kilopascals (kPa): twice the number means that the same push moves the tissue half as far."
 )
-NO_SCALE = "The images show only how stiff the tissues are beside each other, so that each number is a ratio."
+NO_SCALE = "The images show only how stiff the tissues are compared with each other, so each number is a ratio."
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,14 +40,14 @@ def summary(document: Mapping[str, Any]) -> Summary:
             (),
             (
                 "Nothing can be said about how stiff these tissues are.",
-                "The reason stands in the coloured box above.",
+                "The coloured box above gives the reason.",
             ),
             ("Do not use any number or picture of this page as a result.", RESEARCH),
         )
     unit = shown_unit(document)
     return Summary(
         (
-            "The program compared states of one body and sought the stiffness that explains how they differ.",
+            "Palpate compared states of one body. It sought the stiffness that best explains their difference.",
             PASCAL if unit.name == "kPa" else NO_SCALE,
         ),
         tuple((item["tissue"], _found(item, unit)) for item in moduli_in(document)),
@@ -62,12 +62,11 @@ def _found(item: Mapping[str, Any], unit: ModulusUnit) -> str:
     if item["verdict"] == "not identified" or value is None:
         return "no answer. The images do not show how stiff it is."
     about = f"{number(value, digits=2)} {_after(unit)}"
-    if item["verdict"] == "weak":
-        return f"roughly {about}. {_between(interval, 'Any value')} would fit the images nearly as well."
-    kpa = ""
+    about = f"uncertain, roughly {about}" if item["verdict"] == "weak" else f"about {about}"
     if unit.name == "ratio" and item["verdict"] == "identified" and item["value"] is not None:
-        kpa = f" That is about {number(item['value'], digits=2)} kPa."
-    return f"about {about}. {_between(interval, 'The true value probably lies')}{'.' if interval else ''}{kpa}"
+        about += f" (about {number(item['value'], digits=2)} kPa)"
+    what = "value" if unit.name == "kPa" else "ratio"
+    return f"{about}. {_between(interval, f'The true {what} probably lies')}{'.' if interval else ''}"
 
 
 def _after(unit: ModulusUnit) -> str:
@@ -96,29 +95,35 @@ def _by_verdict(document: Mapping[str, Any]) -> dict[str, list[str]]:
 def _sure(document: Mapping[str, Any], unit: ModulusUnit) -> Iterator[str]:
     """How sure the numbers are."""
     of = _by_verdict(document)
-    known = [*of.get("identified", ()), *of.get("ratio only", ())]
     if good := of.get("identified"):
-        yield f"The images fix the stiffness of {listed(good)} well: within a factor of two to each side."
+        whose = "its range" if len(good) == 1 else "each of these ranges"
+        yield (
+            f"The images fix the stiffness of {listed(good)}. The highest value of {whose} is at most four times the"
+            " lowest."
+        )
     if ratios := of.get("ratio only"):
         yield f"The images fix the stiffness of {listed(ratios)} only in comparison with {unit.relative_to}."
     if weak := of.get("weak"):
-        yield f"The stiffness of {listed(weak)} is uncertain: the range counts, not the single number."
+        yield f"The stiffness of {listed(weak)} is uncertain: use the range, not the single number."
     if lost := of.get("not identified"):
-        yield f"Nothing is known about the stiffness of {listed(lost)}."
-    if known:
+        yield f"The images do not fix the stiffness of {listed(lost)}. It may be high, low or normal."
+    if of.keys() - {"not identified"}:
         yield (
-            "'Probably' means: of 100 such ranges about 95 hold the true value, if what the model assumes is right"
-            " (95 % interval)."
+            "'Probably' means: about 95 of 100 such ranges contain the true value (95 % interval). This holds only if"
+            " the model's assumptions are right."
         )
     codes = {str(warning["code"]) for warning in document["warnings"]}
     if "data-misfit" in codes:
-        yield "The model does not explain all of the data: the errors can be larger than the ranges say."
+        yield "The model does not explain all of the data. The true stiffness may lie outside its range."
     if grave := [code for code in codes - {"data-misfit"} if code not in (*WIDENING, *HARMLESS)]:
         count, them = ("A warning says", "it") if len(grave) == 1 else (f"{len(grave)} warnings say", "them")
-        yield f"{count} what can make a number wrong by more than its range; read {them} below."
+        yield f"{count} why the true stiffness may lie outside its range. Read {them} below."
     minima = {start["minimum"] for start in document["starts"] if start["minimum"] is not None}
     if len(minima) > 1:
-        yield f"The search found {len(minima)} different answers; the one that fits best is shown."
+        yield (
+            f"The search found {len(minima)} different answers. The best one is shown; the ranges include those that"
+            " fit nearly as well."
+        )
 
 
 def _avoid(document: Mapping[str, Any], unit: ModulusUnit) -> Iterator[str]:
@@ -128,24 +133,28 @@ def _avoid(document: Mapping[str, Any], unit: ModulusUnit) -> Iterator[str]:
         yield f"Do not use any number for {listed(lost)}."
     if weak := of.get("weak"):
         yield f"Do not quote the number of {listed(weak)} without its range."
-    tissues = document["case"].get("tissues", {})
+    case = document["case"]
+    tissues = case.get("tissues", {})
     if ratios := of.get("ratio only"):
         given = tissues.get(unit.relative_to, {}).get("youngs_modulus_kpa")
-        why = "no stiffness in kPa is known in this body"
+        why = "no tissue of this body has a known stiffness in kPa"
         if isinstance(given, Sequence):
             why = f"the stiffness of {unit.relative_to} is known only between {given[0]:g} and {given[1]:g} kPa"
         yield f"Do not quote kilopascals for {listed(ratios)}: {why}."
     known = [
-        (name, table["youngs_modulus_kpa"])
+        f"{table['youngs_modulus_kpa']:g} kPa for {name}"
         for name, table in tissues.items()
         if table.get("role") == "known" and isinstance(table.get("youngs_modulus_kpa"), float | int)
     ]
-    if known and unit.name == "kPa":
-        what = listed([f"{kpa:g} kPa for {name}" for name, kpa in known])
-        yield f"Do not forget what was assumed: {what}. If that is wrong by a factor, all numbers are wrong by it."
-    if unit.name == "kPa" or of.keys() & {"identified", "weak", "ratio only"}:
-        yield (
-            f"Do not compare these numbers with those of another material law (here: {document['law']}) or of another"
-            " method, such as elastography, as if they were the same quantity."
+    loads = ["the stated loads"] if case.get("loads") else []
+    loads += ["the measured forces"] if any(data["kind"] == "force" for data in case.get("data", ())) else []
+    usable = of.keys() & {"identified", "weak", "ratio only"}
+    if usable and unit.name == "kPa" and (known or loads):
+        wrong = (
+            "one of these is wrong, the numbers are wrong" if known and loads else "the truth is twice that, all double"
         )
+        yield f"Do not quote these numbers without what they assume: {listed([*known, *loads])}. If {wrong}."
+    if usable:
+        yield "Do not compare these numbers with those of elastography, which measures stiffness in another way."
+        yield f"Do not compare them with numbers of another material law (here: {document['law']})."
     yield RESEARCH
