@@ -109,8 +109,8 @@ def make_parser() -> argparse.ArgumentParser:
     """The parser of the whole command line."""
     parser = _Parser(
         prog="palpate",
-        description="How stiff each organ is, from segmented images of the same body in two or more states.",
-        epilog="Exit codes: 0 done, 2 usage or configuration, 3 input data, 4 geometry or meshing, 5 solver or"
+        description="Finds how stiff each organ is, from segmented images of the same body in two or more states.",
+        epilog="Exit codes: 0 done, 1 a bug, 2 usage or configuration, 3 input data, 4 geometry or meshing, 5 solver or"
         " estimation, 6 resources, 130 interrupted. For research only; not a medical device.",
     )
     parser.add_argument("--version", action="version", version=f"palpate {version()}")
@@ -118,10 +118,10 @@ def make_parser() -> argparse.ArgumentParser:
         "--print-completion",
         action=_PrintCompletion,
         choices=("bash", "zsh", "fish"),
-        help="print what makes the shell complete commands, flags and files: source it at the shell's start",
+        help="print a script with which the shell completes commands, flags and files; source it when the shell starts",
     )
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
-    what = "estimate the example that is installed with Palpate, a pelvis: from images to report"
+    what = "estimate the installed example, a pelvis, from images to report"
     demo = _command(subparsers, "demo", written.demo, what=what, folder="palpate-demo")
     _add_overwrite(demo)
     demo.set_defaults(targets=written.TARGETS)
@@ -138,26 +138,28 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_preparations(subparsers: Any) -> None:
     """What makes, checks and tries a case: init, check, noise, voxelise, mesh, simulate."""
-    what = "write a case.toml for images, roles guessed from names"
+    what = "write a case.toml for images, with roles guessed from names"
     init = _command(subparsers, "init", commands.init, what=what)
     init.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help="label images: before, then after ...")
     init.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
     _add_ct(init)
     init.set_defaults(logs=False, targets=("case.toml", "preview.html"))
-    what = "list every problem of a case without computing"
+    what = "list every problem of a case, without an estimate"
     check = _command(subparsers, "check", commands.check, what=what, folder=None)
     check.add_argument("case_file", type=Path, metavar="CASE.TOML", help=CASE_HELP)
     what = "write a page with roles, images, boundary and expected intervals; default: preview.html beside the case"
     check.add_argument("--html", type=Path, nargs="?", const=commands.BESIDE, metavar="FILE", help=what)
     _add_set(check)
-    what = "measure how well surfaces are drawn, on two segmentations of one state: [noise] and [discrepancy] of a case"
+    what = (
+        "measure how well surfaces are drawn, from two segmentations of one state: [noise] and [discrepancy] for a case"
+    )
     noise = _command(subparsers, "noise", commands.noise, what=what, folder=None)
     noise.add_argument("first", type=Path, metavar="A", help="label image")
     noise.add_argument("second", type=Path, metavar="B", help="the same state again: another scan, reader or program")
     noise.add_argument("--labels", type=Path, metavar="TABLE", help="label table: which number is which organ")
     what = "move B onto A first; default: by all surfaces, if the grids differ"
     noise.add_argument("--align", choices=("auto", "surfaces", "none"), default="auto", help=what)
-    what = "make a label image of closed surfaces (STL), one for each organ, named after its file"
+    what = "make a label image from closed surfaces (STL), one file for each organ, whose name it gets"
     voxelise = _command(subparsers, "voxelise", commands.voxelise, what=what)
     voxelise.add_argument("surfaces", type=Path, nargs="+", metavar="SURFACE.STL", help="closed surfaces of one state")
     what = "edge of the voxels, mm; default: %(default)s"
@@ -189,18 +191,18 @@ def _add_estimates(subparsers: Any) -> None:
         type=Path,
         nargs="+",
         metavar="INPUT",
-        help="CASE.TOML, or label images BEFORE AFTER ... for which a case is written first",
+        help="CASE.TOML, or label images BEFORE AFTER ...; for images a case is written first",
     )
-    estimate.add_argument("--labels", type=Path, metavar="TABLE", help="label table, with images")
+    estimate.add_argument("--labels", type=Path, metavar="TABLE", help="label table of the images")
     _add_ct(estimate)
-    what = "first write preview.html, which shows what will be estimated; this makes the mesh twice"
+    what = "first write preview.html, which shows what will be estimated; the mesh is then made twice"
     estimate.add_argument("--preview", action="store_true", help=what)
     _add_overwrite(estimate)
     estimate.set_defaults(targets=written.TARGETS)
     _add_set(estimate)
     what = "draw N samples of the posterior of the moduli in each of 4 chains, as posterior.nc (extra `samples`)"
     estimate.add_argument("--samples", type=_samples, action="append", dest="set", default=[], metavar="N", help=what)
-    what = "estimate a case, then again under changed assumptions; goes on where it was interrupted"
+    what = "estimate a case, then again under changed assumptions; an interrupted run continues"
     sensitivity = _command(subparsers, "sensitivity", written.sensitivity, what=what)
     _add_case(sensitivity)
     what = "also compute Sobol indices from N samples of each input, a power of 2 (extra `sensitivity`)"
@@ -231,7 +233,7 @@ def _add_estimates(subparsers: Any) -> None:
     what = "show the report of an estimate and its files in a browser, on this machine only"
     view = _command(subparsers, "view", commands.view, what=what, folder=None)
     view.add_argument("result", type=Path, metavar="DIR", help="the output folder of an estimate")
-    view.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
+    view.add_argument("--no-browser", action="store_true", help="only print the address")
 
 
 def _add_cohort(subparsers: Any) -> None:
@@ -246,11 +248,11 @@ def _add_cohort(subparsers: Any) -> None:
     )
     command.add_argument("--template", type=Path, metavar="CASE.TOML", help="the case file that is used for all images")
     command.add_argument("--engine", choices=("local", "dask", "slurm"), default="local", help="default: %(default)s")
-    command.add_argument("--scheduler", metavar="ADDRESS", help="of a running Dask scheduler, with --engine dask")
+    command.add_argument("--scheduler", metavar="ADDRESS", help="address of a running Dask scheduler (--engine dask)")
     command.add_argument("--workers", type=_count, metavar="N", help="cases at a time; default: one for each processor")
-    command.add_argument("--resume", action="store_true", help="go on with the cohort in the output folder")
+    command.add_argument("--resume", action="store_true", help="continue the cohort in the output folder")
     command.add_argument("--only-failed", action="store_true", help="in that cohort, compute the failed rows again")
-    what = "compute all rows again, in a folder that has a cohort already, this one or another"
+    what = "compute all rows again; the output folder may have this or another cohort already"
     command.add_argument("--overwrite", action="store_true", help=what)
     command.add_argument(
         "--memory-limit", type=_positive, metavar="GB", help="for each case; default: twice the predicted"
@@ -258,7 +260,9 @@ def _add_cohort(subparsers: Any) -> None:
     command.add_argument(
         "--time-limit", type=_positive, metavar="S", help="for each case; default: ten times the predicted"
     )
-    command.add_argument("--reference", metavar="SESSION", help="of BIDS derivatives; default: each patient's first")
+    command.add_argument(
+        "--reference", metavar="SESSION", help="rest state in BIDS derivatives; default: each patient's first"
+    )
     command.add_argument("--task", type=int, metavar="N", help="what --engine slurm starts: part N of its job array")
     command.set_defaults(targets=cohorts.TARGETS, patience_s=300.0)
     _add_set(command)
