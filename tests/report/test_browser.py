@@ -211,7 +211,7 @@ def test_slices_show_stiffness_or_displacement_with_its_own_bar(opened):
     figure.locator(".colours label", has_text="displacement").click()
     assert bars.all_inner_texts() == ["fitted motion (mm)"]
     motion = drawn(canvas)
-    figure.locator(".colours label", has_text="contours alone").click()
+    figure.locator(".colours label", has_text="contours only").click()
     assert not bars.all_inner_texts()
     bare = drawn(canvas)
     assert min(changed(stiffness, motion), changed(motion, bare), changed(stiffness, bare)) > 0.05
@@ -227,7 +227,7 @@ def test_the_colours_of_a_slice_are_those_of_its_bar(opened, case_result):
     for layer in ("before", "after", "model"):
         figure.locator(f".t-{layer}").set_checked(False)
     coloured = drawn(figure.locator(".live canvas").nth(2))
-    figure.locator(".colours label", has_text="contours alone").click()
+    figure.locator(".colours label", has_text="contours only").click()
     bare = drawn(figure.locator(".live canvas").nth(2))
     (colours,) = {
         tuple(np.rint(colour * 50)) for colour in (modulus_scale(collect(case_result)).colours(np.array([58.9])))
@@ -335,7 +335,7 @@ def test_the_slices_of_a_second_pair_lie_in_its_own_body(browser, two_pairs, tmp
     assert axial[1] - axial[0] == pytest.approx(50.0, abs=1.0)
     first = page.locator("section.slices").first
     first.locator(
-        ".colours label", has_text="contours alone"
+        ".colours label", has_text="contours only"
     ).click()  # the mesh that is kept is that of the first pair
     coronal = [drawn(section.locator("canvas").nth(1)) for section in (first, found)]
     assert changed(*coronal) < 0.03  # the same body: nothing but the millimetres in the corner may differ

@@ -477,7 +477,7 @@ def test_what_would_change_the_answer_is_drawn_and_a_ratio_leads_where_the_scale
     leads, follows = page.index("5.89 <small>× surroundings"), page.index("58.9 kPa if surroundings has 10.0 kPa")
     assert leads < follows
     assert "over that range 47.1 to 73.6 kPa" in page
-    assert "The interval holds none of these." in page
+    assert "The interval covers none of these." in page
     in_kpa = dataclasses.replace(estimation, estimates=(first, second))
     page_in_kpa = words_of(dataclasses.replace(case_result, estimation=in_kpa))
     assert "Tornado of prostate: modulus of surroundings: x 1.2: +20 %" in page_in_kpa
@@ -514,7 +514,7 @@ def test_two_moduli_together_and_what_each_image_says_alone_are_shown_where_they
 
 
 def test_a_result_of_one_image_says_nothing_of_repeats(page):
-    assert "says alone" not in page
+    assert "says by itself" not in page
 
 
 def test_without_measurements_nothing_of_them_is_on_the_page(page):

@@ -35,10 +35,10 @@ OTHERS = "others"
 FADING = 0.6  # of a cause's opacity, that of the next one on the bar
 FOUND = {
     "identified": "The images fix the stiffness of {}.",
-    "weak": "The stiffness of {} is less sure: use the interval, not the number alone.",
+    "weak": "The stiffness of {} is uncertain: use the interval, not only the number.",
     "ratio only": "The images fix the stiffness of {} only as a ratio, not in kilopascals.",
 }
-MISSED = "The fitted model misses some of the data by more than their errors: the interval does not cover that."
+MISSED = "The fitted model misses some of the data by more than their errors. The interval does not cover this."
 OPEN = "The images do not fix the stiffness of {}: do not use {}."
 
 
