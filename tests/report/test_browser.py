@@ -334,9 +334,7 @@ def test_the_slices_of_a_second_pair_lie_in_its_own_body(browser, two_pairs, tmp
     axial = [float(page.locator("section.slices input[type=range]").nth(3 * k).input_value()) for k in (0, 1)]
     assert axial[1] - axial[0] == pytest.approx(50.0, abs=1.0)
     first = page.locator("section.slices").first
-    first.locator(
-        ".colours label", has_text="contours only"
-    ).click()  # the mesh that is kept is that of the first pair
+    first.locator(".colours label", has_text="contours only").click()  # the mesh that is kept is that of the first pair
     coronal = [drawn(section.locator("canvas").nth(1)) for section in (first, found)]
     assert changed(*coronal) < 0.03  # the same body: nothing but the millimetres in the corner may differ
     assert changed(coronal[1], np.zeros_like(coronal[1])) > 0.2
