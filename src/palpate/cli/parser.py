@@ -261,7 +261,7 @@ def _add_cohort(subparsers: Any) -> None:
         "--time-limit", type=_positive, metavar="S", help="for each case; default: ten times the predicted"
     )
     command.add_argument(
-        "--reference", metavar="SESSION", help="rest state in BIDS derivatives; default: each patient's first"
+        "--reference", metavar="SESSION", help="reference state in BIDS derivatives; default: each patient's first"
     )
     command.add_argument("--task", type=int, metavar="N", help="what --engine slurm starts: part N of its job array")
     command.set_defaults(targets=cohorts.TARGETS, patience_s=300.0)
