@@ -97,7 +97,7 @@ def _run(case: Path) -> dict[str, Any]:
 def _estimated(path: Path) -> dict[str, Any]:
     """What an estimate finds and takes."""
     began, truth = time.perf_counter(), json.loads((path.parent / "truth.json").read_text())["moduli_kpa"]
-    document = palpate.estimate(palpate.read_case(path), truth=truth).document
+    document = palpate.estimate(palpate.read_case(path), truth=truth).to_dict()
     spent = resource.getrusage(resource.RUSAGE_SELF)
     kept = ("tissue", "value", "interval95", "verdict", "truth")
     return {
@@ -145,7 +145,7 @@ def patient_folder(seed: int, law: str, noise_mm: float, cache: Path) -> Path:
         warp = smooth_field(of, sd_mm=noise_mm, correlation_mm=NOISE_LENGTH_MM).warp
         name = f"after-{number}" if number else "before"
         write_label_image(made / f"{name}.nii.gz", imaged(space, moved + lies, grid, warp=warp))
-    tissues = {}
+    tissues = dict[str, dict[str, Any]]()
     for label, tissue in enumerate(space.mesh.tissues, start=1):
         known = tissue.name == "surroundings"
         tissues[tissue.name] = {"label": "remaining" if known else label, "role": str(tissue.role)}

@@ -51,7 +51,9 @@ def test_where_there_is_no_terminal_a_sentence_stays_one_line():
 
 
 def test_a_setting_without_an_estimate_says_why_in_the_table():
-    row = TornadoRow("material law", "re-estimated", {"linear": 0.1}, (), {"mooney-rivlin": "no equilibrium was found"})
+    row = TornadoRow(
+        "material law", "re-estimated", False, {"linear": 0.1}, (), {"mooney-rivlin": "no equilibrium was found"}
+    )
     assert effect_text(row, reasons=True) == "linear: +10.5 %, mooney-rivlin: no equilibrium was found"
     assert effect_text(row) == "linear: +10.5 %, mooney-rivlin: no estimate"
 

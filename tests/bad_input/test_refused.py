@@ -75,7 +75,7 @@ REFUSED = {
     "13 a folder without masks": (
         lambda f: [(f / "after").mkdir(), (f / "after" / "notes.txt").write_text("x"), replace_after(f, "after")],
         3,
-        "has 0 masks",
+        "holds 0 masks",
     ),
     "16 a DICOM slice": (lambda f: dicom(f, "IM0001"), 3, "dcm2niix or 3D Slicer"),
     "16 a DICOM series": (lambda f: dicom(f, "ct/IM0001.dcm"), 3, "dcm2niix or 3D Slicer"),

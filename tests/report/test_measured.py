@@ -152,7 +152,7 @@ def test_the_page_shows_them_and_says_how(measured):
     assert "+2.00" in words  # 12.4 N less 12.0 N over 0.2 N
     assert "could not be" not in words
     assert "<img src=x" not in page
-    assert len(re.findall("<script>", page)) == 9
+    assert len(re.findall("<script>", page)) == 11
 
 
 def test_points_come_back_from_their_file(measured, tmp_path):

@@ -76,7 +76,7 @@ def test_a_mesh_is_made_of_a_case_whatever_its_path_is(folder):
     result = palpate.make_mesh(read, progress=told.append)
     assert result.mesh_summary.tets == len(result.space.mesh.tets) > 100
     assert told[0] == "reading the images"
-    roles = "estimate prostate; driver rectum; known body"
+    roles = "estimate prostate; driver rectum; known surroundings"
     assert repr(read) == f"<case '{read.id}': before.nii.gz, after.nii.gz; {roles}; neo-hookean>"
     assert repr(result).startswith(f"<mesh of '{read.id}': {result.mesh_summary.tets:,} tetra".replace(",", " "))
     assert "\n" not in repr(result)

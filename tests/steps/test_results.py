@@ -9,6 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from palpate.errors import ConfigurationError, ResourceError
+from palpate.findings import HELP
 from palpate.steps.results import CaseResult
 
 NUMBERS = ["value_kpa", "low_kpa", "high_kpa", "ratio", "ratio_low", "ratio_high"]
@@ -68,6 +69,7 @@ def test_a_result_is_printed_a_line_a_tissue_with_open_ends_in_words(result):
         "prostate: 58.9 kPa (95 %: > 47.1 kPa), identified: high / low is 1.56",
         "bladder: 3.12 x surroundings (95 %: < 5.00), identified: high / low is 1.56",
         "warning (example): a warning to be shown",
+        f"each code is explained on {HELP}",
     ]
     lost = str(with_estimates(result, {"interval95": None, "verdict": "not identified"})).splitlines()
     assert lost[0] == "prostate: 58.9 kPa, not identified: high / low is 1.56"

@@ -52,7 +52,8 @@ def test_an_edge_is_no_longer_than_shows_a_surface_and_no_shorter_than_pays():
     speck = chosen(image(4.0))
     assert speck.mm == 3.0
     assert (
-        "shortest that is chosen, for 5.0 edges across 'gland', as large as a ball of 8 mm would be 1.6" in speck.reason
+        "shortest that is chosen automatically; 5.0 edges across 'gland', as large as a ball of 8 mm would be 1.6"
+        in speck.reason
     )
 
 

@@ -380,7 +380,7 @@ def test_chains_that_are_too_short_are_remarked_with_what_to_do(sampled, inversi
     assert "samples-not-mixed" not in codes(sampled)
     short = conclude(inversion, settings, observed, truth={}, seed=1, samples=100)
     (remark,) = (remark for remark in short.remarks if remark.code == "samples-not-mixed")
-    assert "gland (R-hat 1." in remark.message
+    assert "'gland' (R-hat 1." in remark.message
     assert "--samples 400" in remark.message
 
 

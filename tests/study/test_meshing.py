@@ -58,16 +58,17 @@ def test_a_mesh_that_is_not_fit_is_followed_by_finer_ones_which_the_result_tells
     told = []
     found = mesh_of(case_result, 4.0, told.append)
     assert tried == [4.0, 3.0, 2.25]
-    assert found.edge_length == EdgeLength(2.25, "a mesh of 4 mm was not fit")
+    assert found.edge_length == EdgeLength(2.25, "a mesh of 4 mm failed its quality check")
     (finding,) = found.findings
     assert finding.code == "finer-mesh"
-    assert "mesh.edge_length_mm = 2.25 in place of 4" in finding.message
-    assert "a dihedral angle at 3 mm" in finding.message
-    assert any("not fit: a dihedral angle at 4 mm" in line for line in told)
+    assert "edges of 4 mm failed its quality check, so one with edges of 2.25 mm is used" in finding.message
+    assert any("failed: a dihedral angle at 4 mm" in line for line in told)
 
 
 def test_after_two_finer_meshes_the_last_refusal_stands_with_all_that_was_tried(case_result, tried):
-    with pytest.raises(MeshQualityError, match=r"= 5 nor at 3.75 and 2.812 mm, where a dihedral angle at 2.812 mm"):
+    with pytest.raises(
+        MeshQualityError, match=r"= 5 nor with 3.75 and 2.812 mm. With the last one, a dihedral angle at 2.812 mm"
+    ):
         mesh_of(case_result, 5.0)
     assert len(tried) == 3
 

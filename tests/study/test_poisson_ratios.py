@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from dataclasses import replace
 
@@ -181,7 +182,7 @@ def test_documents_pages_tables_and_exports_tell_ratios_from_moduli(with_ratio, 
     assert ["prostate", "0.470", ">", "0.440", "not", "identified"] in [line.split() for line in table]
     page = write_case_report(with_ratio, tmp_path).read_text()
     assert "0.470" in page
-    assert "nu of prostate" in page
+    assert "Poisson's ratio of prostate" in html.unescape(page)
     model = fitted_model(with_ratio, seal="")
     assert model.covariance.shape == (2, 2)
     assert model.tissues[0].poisson_ratio == 0.47

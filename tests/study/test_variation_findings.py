@@ -40,7 +40,7 @@ def test_one_assumption_is_one_line_that_names_every_tissue():
     )
     (line,) = one_a_cause(both)
     assert "'gland' would have 10 kPa" in line.message
-    assert line.message.endswith("also 'muscle' would have 40 kPa, outside 16 to 25")
+    assert "also 'muscle' would have 40 kPa, outside 16 to 25. State" in line.message
     assert len(line.message.split()) <= 60
 
 

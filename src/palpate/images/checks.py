@@ -400,7 +400,7 @@ def _emptied(before: Segmentation, after: Segmentation, name: str) -> list[Findi
         return []
     text = (
         f"'{tissue}' shrinks by {loss:.0%} from 'before' to '{name}': is 'before' the relaxed state? If '{name}' is,"
-        " exchange the two images"
+        " exchange the two images."
     )
     return [Finding("relaxed-state", text, tissue, f"to '{name}' ({loss:.0%})")]
 

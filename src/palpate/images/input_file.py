@@ -73,12 +73,18 @@ def like(path: Path) -> str:
         if missing is None:
             return ""
         names = sorted(islice((entry.name for entry in os.scandir(missing.parent)), MOST_COMPARED))
-        found = difflib.get_close_matches(missing.name, names, n=1, cutoff=ALIKE)
+        close = difflib.get_close_matches(missing.name, names, cutoff=ALIKE)
+        # the ending alone makes 'after.nii.gz' and 'before.nii.gz' similar
+        found = [name for name in close if _alike(missing.name.partition(".")[0], name.partition(".")[0])]
         if found:
             meant = missing.with_name(found[0])
             whole = meant / path.relative_to(missing)
             return f", did you mean '{printable(str(whole if whole.exists() else meant))}'?"
     return ""
+
+
+def _alike(one: str, other: str) -> bool:
+    return difflib.SequenceMatcher(None, one, other).ratio() >= ALIKE
 
 
 def open_input(path: Path) -> InputFile:

@@ -52,7 +52,7 @@ def log_determinant(matrix: NDArray[np.float64], images: Images) -> float:
 
 
 def shared_by(images: Images, n_unknowns: int) -> NDArray[np.int64]:
-    """Numbers of the unknowns that belong to no single image."""
+    """Numbers (n_shared,) of the unknowns that belong to no single image."""
     every = np.ones(n_unknowns, dtype=bool)
     for own in images:
         every[own] = False

@@ -126,4 +126,4 @@ def _draw(write: Callable[[], Path], staging: Staging, document: dict[str, Any])
 
 
 def _no_report(error: Exception) -> Finding:
-    return Finding("report", f"{PAGE} could not be written ({error}); the numbers are unharmed")
+    return Finding("report", f"{PAGE} could not be written ({error}); the numbers are unharmed.")

@@ -110,7 +110,7 @@ def stage_case(case: Case, staging: Staging) -> tuple[Finding, ...]:
     if not own and _says(path, case):
         return ()
     if not own and not (case.overrides and CASE_NAME in staging.written):  # by `palpate init`, in the same run
-        text = f"{path.name} in the output folder was changed during the run and is not the case of it"
+        text = f"{path.name} in the output folder was changed during the run and is not the case of it."
         return (Finding("case-file", text),)
     try:
         write_text(staging.area / CASE_NAME, case_text(case, staging.folder))

@@ -169,10 +169,7 @@ def variation_findings(variations: Sequence[Variation], estimates: Sequence[Modu
         for of in estimates:
             if words := _farthest_outside(settings, of):
                 setting, moved = words
-                text = (
-                    "an assumption weighs more than the 95 % interval: state it with the result."
-                    f" {label[0].upper()}{label[1:]}, {setting}: {moved}"
-                )
+                text = f"{label[0].upper()}{label[1:]}, {setting}: {moved}. State this assumption with the result."
                 findings.append(Finding("beyond-interval", text, about=label, place=moved))
     return tuple(findings)
 

@@ -86,7 +86,7 @@ def plausibility_warnings(moduli_kpa: Mapping[str, float]) -> tuple[Finding, ...
         text = (
             f"{name}: {value:.3g} kPa lies more than {MARGIN:g} times outside the published"
             f" range for {closest.tissue}, {low:g} to {high:g} kPa ({closest.reference})."
-            " Check the modulus of the `known` tissue, the labels and the boundary"
+            " Check the modulus of the `known` tissue, the labels and the boundary."
         )
         found.append(Finding("implausible-stiffness", text))
     return tuple(found)
@@ -130,7 +130,7 @@ def unit_warnings(case: Case) -> tuple[Finding, ...]:
                 Finding(
                     "units",
                     f"tissue '{name}': youngs_modulus_kpa = {value:g} is unusual for {what}, which has {low:g} to"
-                    f" {high:g} kPa with room for methods. If you meant {value:g} {unit}, write {value * factor:g}",
+                    f" {high:g} kPa with room for methods. If you meant {value:g} {unit}, write {value * factor:g}.",
                 )
             )
     return tuple(hints)

@@ -194,7 +194,7 @@ def test_contours_without_their_slices_or_across_them_are_refused(tmp_path: Path
     ):
         read_label_image(path)
     save_series(tmp_path / "ct", [*slices[:5], *slices[6:]])
-    with pytest.raises(InputDataError, match=r"the 13 slices beside .* are no stack"):
+    with pytest.raises(InputDataError, match=r"13 slices of the series beside .* differ in size, or are not evenly"):
         read_label_image(path)
     save_series(tmp_path / "ct", slices[5:6])
     across = np.array([[2, 9, 9], [2, 9, 19], [5, 29, 19]])

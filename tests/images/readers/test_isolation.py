@@ -156,7 +156,7 @@ def test_memory_beyond_the_limit_is_a_resource_error(tmp_path: Path) -> None:
     struct.pack_into("<3h", content, 42, 512, 1024, 1024)
     path.write_bytes(content)
     os.truncate(path, 352 + 2**29)  # a hole: the file is that long, but takes no room
-    with pytest.raises(ResourceError, match=r"a\.nii' does not fit into the memory"):
+    with pytest.raises(ResourceError, match=r"a\.nii' needs more memory than a reader may use"):
         read_label_image(path, limits=ReadLimits(memory_bytes=2**29))
 
 
