@@ -154,7 +154,7 @@ def _banner(problems: Sequence[Problem], prediction: Prediction | None) -> dict[
         return {"kind": "bad", "title": title, "sentences": (f"{_count(refused, 'problem')} must be solved first.",)}
     sentences: tuple[str, ...] = ("No problem was found.",)
     if warned:
-        sentences = (f"{_count(warned, 'warning')} to be read first.",)
+        sentences = (f"Read {_count(warned, 'warning')} first.",)
     if prediction is None:
         return {"kind": "fair" if warned else "good", "title": "The case can be estimated.", "sentences": sentences}
     lost = [of.tissue for of in prediction.moduli if of.verdict == "not identified"]
