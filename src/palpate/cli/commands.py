@@ -160,7 +160,7 @@ def figures(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progr
     refuse_settings(formats, arguments.dpi)
     if outputs.same_files([""], [arguments.result]):
         raise ConfigurationError(f"{outputs.path} is the folder of the result itself: choose another --output")
-    progress("reading the result")
+    progress(Line("reading the result"))
     data = read_data(arguments.result)
     drawn = figures_into(outputs, data, formats=formats, unit=arguments.unit, dpi=arguments.dpi, progress=progress)
     document = {

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.errors import EstimationError, InputDataError
-from palpate.progress import Progress, silent
+from palpate.progress import Line, Progress, silent
 from palpate.report.figures.maps import map_sheet
 from palpate.report.figures.moduli import chosen_unit, moduli_sheet
 from palpate.report.figures.motion import motion_caption, motion_gif
@@ -58,7 +58,7 @@ def write_figures(
     units = units_of(data, unit)
     found = list[WrittenFigure]()
     for name, make in _drawings(data, units):
-        progress(f"drawing {name}")
+        progress(Line(f"drawing {name}"))
         try:
             files, caption = make(formats, dpi)
         except MemoryError:
