@@ -336,6 +336,24 @@ def pairs_of(results: Sequence[Values]) -> Values:
     }
 
 
+def patients(place: Place) -> Values:
+    """One patient with more and more later images."""
+    words = shlex.split(PARTS["patients"].command)[1:]
+    out = place.folder / "patients.jsonl"
+    run([sys.executable, *words, "--cache", place.folder / "patients", "--output", out])
+    return patients_of(lines_of(out))
+
+
+def patients_of(results: Sequence[Values]) -> Values:
+    """What each number of images costs, and what is stated then."""
+    keys = ("processor_seconds", "peak_gb")
+    rows = {
+        str(row["images"]): {key: row[key] for key in keys} | {"verdicts": [e["verdict"] for e in row["estimates"]]}
+        for row in results
+    }
+    return {"rows": rows}
+
+
 def speed(place: Place) -> Values:
     """The default case."""
     del place
@@ -433,5 +451,6 @@ PARTS = {
     "speed": Part("python benchmarks/speed.py --parts default", 5, speed),
     "verification": Part("palpate verify", 5, verification),
     "pictures": Part("python docs/pictures/draw.py", 3, pictures),
+    "patients": Part("python benchmarks/patients.py --patients 1 --noise 0.3", 25, patients, asked=True),
     "pairs": Part("python benchmarks/pairs.py --patients 20 --first-seed 701", 300, pairs, asked=True),
 }

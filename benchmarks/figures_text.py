@@ -244,6 +244,17 @@ def _speed(values: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def _patients(values: Mapping[str, Any]) -> list[str]:
+    """What a number of later images of one patient costs."""
+    head = ["later images", "time of one processor", "peak memory", "verdict of prostate, bladder"]
+    lines = [_cells(head), _cells(["---"] * len(head))]
+    for images, row in values["rows"].items():
+        verdicts = [verdict if verdict == "not identified" else f"`{verdict}`" for verdict in row["verdicts"]]
+        words = "both " + verdicts[0] if len(set(verdicts)) == 1 else ", ".join(verdicts)
+        lines.append(_cells([images, f"{row['processor_seconds']:.0f} s", f"{row['peak_gb']:.1f} GB", words]))
+    return lines
+
+
 FAMILIES = {  # of `palpate verify`: what each is, and with what it is compared
     "B0": "patch test, rotations, translation (exact)",
     "B1 to B3": "thick spheres and cylinders under pressure, nu up to 0.4999 (closed form; Code_Aster)",
@@ -283,6 +294,7 @@ VIEWS = {
     "mismatch.finite-table": View("mismatch", "finite", _mismatch),
     "mismatch.noise-table": View("mismatch", "noise", _mismatch),
     "coverage.table": View("coverage", "", _coverage),
+    "patients.table": View("patients", "", _patients),
     "speed.table": View("speed", "", _speed),
     "verification.table": View("verification", "", _verification),
 }

@@ -20,7 +20,7 @@ def test_a_part_is_told_with_its_volume_place_contrast_and_probability():
     words = map_words(map_of(0.8, region))
     for told in (
         "'prostate'",
-        "1.4 ml",
+        "1.4 mL",
         "(1, -30, 8) mm",
         "0.4 times",
         "0.3 to 0.55",

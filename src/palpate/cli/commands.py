@@ -94,7 +94,7 @@ def voxelise(arguments: argparse.Namespace, _: None, outputs: OutputFolder, prog
         write_label_image(staging.area / "surfaces.nii.gz", found.image)
         write_json(staging.area / "labels.json", {"labels": document["labels"]})
         staging.commit()
-    rows = [["label", "organ", "volume of the surface, ml", "of its voxels, ml"]]
+    rows = [["label", "organ", "volume of the surface, mL", "of its voxels, mL"]]
     for label, name in found.image.names.items():
         rows.append([str(label), name, *(f"{volume / 1000.0:.4g}" for volume in found.volumes_mm3[name])])
     return Outcome(document, f"{columns(rows)}\n{warning_lines(document)}{listed(outputs)}")

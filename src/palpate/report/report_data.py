@@ -204,7 +204,7 @@ class InputImage:
     """One label image of the case: its name, number of its pair, its voxels and their edges (mm), SHA-256 of its file.
 
     later: whether it shows a later state; volumes_ml: of each tissue, of its voxels, or of its
-    elements where the body is given as a mesh, ml.
+    elements where the body is given as a mesh, mL.
     """
 
     name: str
