@@ -29,7 +29,7 @@ from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, finite_strain_model
 from palpate.mechanics.hyperelastic import elements_of
 from palpate.mechanics.laws.contract import Law
-from palpate.mechanics.linear_model import LinearEquilibrium, poisson_tangents
+from palpate.mechanics.linear_model import LinearEquilibrium, LinearSystem, poisson_tangents
 from palpate.mechanics.newton import NewtonSettings
 from palpate.observation.contract import Imaged, OfMaterial, seen_by
 from palpate.uncertainty.profile import PASSES, refitted
@@ -113,14 +113,19 @@ def fast_path(objective: Objective, minimum: Minimum, bounds: Bounds) -> FastPat
 
 
 def exact_equilibria(objective: Objective, unknowns: NDArray[np.float64]) -> Equilibria:
-    """The equilibrium of each later state at unknowns (n_unknowns,), with its factorisation; raises `SolverError`."""
-    found: list[LinearEquilibrium | FiniteStrainEquilibrium] = []
-    for state, of, place in zip(
-        objective.states, objective.approximations, objective.linearisation_points(unknowns), strict=True
-    ):
-        found.append(
-            of.equilibrium if isinstance(of, Expansion) else state.model.solve(place.moduli, place.coefficients)
-        )
+    """The equilibrium of each later state at unknowns (n_unknowns,), with its factorisation; raises `SolverError`.
+
+    States of one body share a factorisation under the linear law.
+    """
+    found, systems = list[LinearEquilibrium | FiniteStrainEquilibrium](), list[LinearSystem]()
+    points = objective.linearisation_points(unknowns)
+    for state, of, place in zip(objective.states, objective.approximations, points, strict=True):
+        if isinstance(of, Expansion):
+            found.append(of.equilibrium)
+            continue
+        same = [system for system in systems if state.model.same_stiffness(system.model)]
+        systems.append(same[0].of(state.model) if same else state.model.system(place.moduli))
+        found.append(systems[-1].solve(place.coefficients))
     return tuple(found)
 
 
