@@ -126,7 +126,7 @@ def stiffness_sheet(data: ReportData) -> Sheet:
     caption = (
         f"Estimated Young's modulus over {reference.name}, in axial, coronal and sagittal slices. Only organs whose"
         " modulus was estimated are coloured; lines are the contours of the segmentation. The colours show"
-        f" {scale.label} on a logarithmic scale, with marks at the moduli of all tissues of the model. {RADIOLOGICAL}"
+        f" {scale.label} on a logarithmic scale, from the softest to the stiffest tissue of the model. {RADIOLOGICAL}"
     )
     height = TITLE_MM + max(strip.heights_mm) + LEGEND_MM + BAR_MM
     return Sheet("stiffness-slices", caption, PAGE_MM, height, draw)
