@@ -238,6 +238,17 @@ def test_stray_voxels_and_tiny_organs_are_told() -> None:
     assert codes(findings) == ["islands", "too-small"]
 
 
+def test_a_tissue_of_a_left_and_a_right_label_has_two_pieces() -> None:
+    index = np.zeros((40, 30, 30), dtype=np.int16)
+    index[4:16, 5:25, 5:25] = index[24:36, 5:25, 5:25] = 1
+    both = (TISSUES[0], replace(TISSUES[1], labels=(1, 9)), *TISSUES[2:])
+    image = Segmentation(index, VoxelGrid((40, 30, 30), np.eye(4)), both)
+    assert codes(check_segmentation(image, "before")) == []
+    assert codes(check_segmentation(replace(image, tissues=TISSUES), "before")) == ["islands"]
+    index[1, 1, 1] = 1
+    assert codes(check_segmentation(replace(image, index=index), "before")) == ["islands"]
+
+
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_voxels_in_metres_or_micrometres_are_told(scale: float) -> None:
     affine = AFFINE * scale

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,12 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
     for path in (tmp_path / "pipe", tmp_path, Path("/dev/zero")):
         with pytest.raises(OSError, match="not a file"):
             open_input(path)
+
+
+def test_of_a_folder_with_a_case_the_case_is_meant(tmp_path: Path) -> None:
+    (tmp_path / "case.toml").write_text("")
+    with pytest.raises(OSError, match=re.escape(f"did you mean '{tmp_path / 'case.toml'}'?")):
+        open_input(tmp_path)
 
 
 def test_a_grey_image_that_changed_since_the_run_began_is_refused(tmp_path: Path) -> None:

@@ -87,6 +87,19 @@ def test_the_result_of_another_case_is_replaced_only_if_that_is_asked_for(estima
     assert document(out)["id"] == "bert"
 
 
+@pytest.mark.parametrize("command", ["mesh", "simulate", "sensitivity"])
+def test_no_other_command_works_in_the_folder_of_another_case(estimate, out, tmp_path, capsys, command):
+    assert estimate("anna", "--quiet") == 0
+    assert estimate("bert", "--quiet", "--output", str(tmp_path / "b")) == 0
+    before = files(out)
+    capsys.readouterr()
+    assert main([command, str(tmp_path / "bert.toml"), "--output", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert "holds the result of another case, 'anna'" in said
+    assert "--overwrite" not in said, "the command has no such flag"
+    assert files(out) == before
+
+
 def test_the_same_case_after_an_edit_is_run_into_its_folder_again(estimate, out):
     for flags in ((), ("--set", "seed=3"), ("--set", "mechanics.law=linear")):
         assert estimate("anna", "--quiet", *flags, overwrite=False) == 0

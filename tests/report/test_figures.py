@@ -96,6 +96,7 @@ def test_each_figure_has_a_caption_with_unit_and_state(written):
     assert "ratio to that of surroundings" in by_name["moduli-ratio"]
     assert "from before.nii.gz to after.nii.gz, in mm" in by_name["displacement-1"]
     assert "true value of the simulation" in by_name["moduli-kpa"]
+    assert "marks at the moduli" not in by_name["stiffness-slices"], "the bar has round numbers, as every axis has"
 
 
 def test_the_animation_goes_there_and_back_and_moves(written):

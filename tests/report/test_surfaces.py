@@ -12,7 +12,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.report.pairs import bone_distances
-from palpate.report.surfaces import carried_outline, image_surface, model_surface
+from palpate.report.surfaces import carried_outline, image_surface, model_surface, outer_first
 
 TURNED = np.array([[0, 1.5, 0, -5.0], [1.0, 0, 0, -5.0], [0, 0, -2.0, 50.0], [0, 0, 0, 1]])
 
@@ -41,6 +41,14 @@ def test_the_surface_of_a_ball_is_closed():
     edges = np.sort(surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     _, count = np.unique(edges, axis=0, return_counts=True)
     assert (count == 2).all()
+
+
+def test_the_line_of_an_inner_organ_lies_on_top_of_that_of_the_organ_around_it():
+    radii = (6.0, 14.0, 0.0, 10.0)
+    found = outer_first(image_surface(ball(radius)[0], 1, smoothing_mm=1.2) for radius in radii)
+    widths = [float(np.ptp(of.points, axis=0).max()) for of in found]
+    assert len(found) == 3, "what has no voxel has no line"
+    assert widths == sorted(widths, reverse=True)
 
 
 def test_a_tissue_without_voxels_has_no_surface():

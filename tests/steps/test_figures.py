@@ -43,6 +43,17 @@ def test_the_command_lists_what_it_wrote(folder, tmp_path, capsys):
     assert all(of["caption"] and of["files"] for of in document["figures"])
 
 
+def test_neither_figures_nor_exports_are_written_among_the_files_of_another_result(folder, case_result, tmp_path):
+    other = tmp_path / "other"
+    save_estimate(case_result, OutputFolder(other))
+    before = {path.name: path.read_bytes() for path in other.iterdir()}
+    with pytest.raises(ConfigurationError, match="choose another --output"):
+        palpate.figures(folder, other, formats=["svg"])
+    with pytest.raises(ConfigurationError, match="choose another --output"):
+        palpate.export(folder, other, format="slicer")
+    assert {path.name: path.read_bytes() for path in other.iterdir()} == before
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

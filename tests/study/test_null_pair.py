@@ -115,3 +115,11 @@ rest = { label = "remaining", role = "known", youngs_modulus_kpa = 3.0 }
     read = palpate.read_case(tmp_path / "case.toml")
     assert read.noise.surface_sd_mm == pytest.approx(document["noise"]["surface_sd_mm"], rel=0.01)
     assert palpate.noise(*paths).to_dict() == document
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_an_image_in_another_unit_of_length_is_named_as_such(factor):
+    one, other = pair(0)
+    grid = VoxelGrid(GRID.shape, np.diag([factor, factor, factor, 1.0]))
+    with pytest.raises(InputDataError, match="header seems to be in"):
+        noise_of_drawings(replace(one, grid=grid), replace(other, grid=grid))

@@ -73,6 +73,23 @@ def test_a_modulus_is_guessed_as_its_tissue_states_it(prediction_of):
     assert not found.stated
 
 
+@pytest.mark.parametrize(
+    ("interval", "words"),
+    [
+        ((None, None), "95 % interval open at both ends (not identified)"),
+        ((2.0, None), "95 % interval above 2 kPa (not identified)"),
+        ((None, 9.0), "95 % interval below 9 kPa (not identified)"),
+        ((2.0, 9.0), "95 % interval 2 to 9 kPa (not identified)"),
+    ],
+)
+def test_an_open_end_is_told_in_words(prediction_of, interval, words):
+    found = prediction_of()
+    lines = replace(
+        found, moduli=tuple(replace(of, interval95=interval, verdict="not identified") for of in found.moduli)
+    ).lines()
+    assert all(line.endswith(words) for line in lines)
+
+
 def test_what_a_case_rules_out_has_no_share(states):
     case = case_of(coarse_balls(), discrepancy=Discrepancy(0.0, 25.0, 0.0, 0.0, layer_sd=0.0))
     found = predicted_intervals([make_body(states, case, progress=silent)], case, progress=silent)

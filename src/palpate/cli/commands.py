@@ -104,8 +104,10 @@ def mesh(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Pro
     """Make a mesh and write it."""
     from palpate.export.case_files import write_mesh_files
     from palpate.steps.saving import save_document
+    from palpate.study.earlier import refuse_other_result
     from palpate.study.run import make_mesh
 
+    refuse_other_result(case, outputs.path)
     result = make_mesh(case, progress=progress)
     progress(Line("writing the mesh"))
     document = result.to_dict()
@@ -124,8 +126,10 @@ def simulate(arguments: argparse.Namespace, case: Case, outputs: OutputFolder, p
     """Simulate a later state and write it."""
     from palpate.export.case_files import write_simulation_files
     from palpate.steps.saving import save_document
+    from palpate.study.earlier import refuse_other_result
     from palpate.study.simulate import simulate as simulated
 
+    refuse_other_result(case, outputs.path)
     result = simulated(case, steps=arguments.steps, progress=progress)
     progress(Line("writing the simulated state"))
     document = result.to_dict()

@@ -69,9 +69,11 @@ def sensitivity(arguments: argparse.Namespace, case: Case, outputs: OutputFolder
     """How each modulus depends on what it rests on, the largest effect first."""
     from palpate.report.tornado import sensitivity_table
     from palpate.steps.saving import save_sensitivity
+    from palpate.study.earlier import refuse_other_result
     from palpate.study.sensitivity import Kept
     from palpate.study.sensitivity import sensitivity as vary
 
+    refuse_other_result(case, outputs.path)
     found = vary(case, kept=Kept(outputs), sobol=arguments.sobol, progress=progress)
     document = save_sensitivity(found, outputs)
     text = f"{columns(sensitivity_table(document))}\n{warning_lines(document)}{listed(outputs)}"

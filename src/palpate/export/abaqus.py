@@ -53,8 +53,8 @@ def _text(model: FittedModel, body: FittedBody, space: LagrangeSpace, element: s
         dict.fromkeys([*tissues, *(group.name for group in groups), *(part.name for part in materials)])
     )
     parts = [
-        "*HEADING\nFitted by Palpate. Units: mm, kPa, mN; RAS coordinates.\n",
-        f"** {model.units}\n** law: {model.law}; Palpate's element: {model.element}\n",
+        f"*HEADING\nFitted by Palpate.\n** units: {model.units}\n",
+        f"** law: {model.law}; Palpate's element: {model.element}\n",
         *(f"** {plain}: {name}\n" for name, plain in names.items() if name.isprintable()),
         "*NODE, NSET=ALL_NODES\n",
         rows("%d, %.12g, %.12g, %.12g", np.arange(1, len(space.points) + 1), space.points),
@@ -73,7 +73,7 @@ def _text(model: FittedModel, body: FittedBody, space: LagrangeSpace, element: s
         name = names[part.name]
         if part.name not in tissues:
             parts += [f"*ELSET, ELSET={name}\n", wrapped(part.cells + 1)]
-        # the law with its constants in kPa, D1 in 1/kPa
+        # the law with its constants in the model's unit of stress, D1 in its inverse
         modulus = float(model.moduli[part.tissue] * np.exp(part.log_ratio))
         ratio, law = body.tissues[part.tissue].poisson_ratio, model.law_among(*LAWS)
         shear, compliance = modulus / (2.0 * (1.0 + ratio)), 6.0 * (1.0 - 2.0 * ratio) / modulus

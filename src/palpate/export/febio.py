@@ -45,7 +45,7 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     acting = list(dict.fromkeys(load for of_image in body.loads for load in of_image))
     loads = loads_on(space, acting, densities=model.densities)
     root = Element("febio_spec", version="4.0")
-    root.append(ET.Comment(f" fitted by Palpate; {model.units}; stresses in kPa, forces in mN "))
+    root.append(ET.Comment(f" fitted by Palpate; {model.units} "))
     _add(root, "Module", type="solid")
     material = _add(root, "Material")
     groups = enumerate(tissue_groups(body.mesh).items(), start=1)

@@ -133,8 +133,9 @@ class FittedModel:
     @property
     def units(self) -> str:
         """The units of all numbers, as a file's heading says them."""
-        stress = "kPa" if self.unit == "kPa" else f"moduli are ratios to '{self.relative_to}'"
-        return f"mm, {stress}; RAS coordinates"
+        if self.unit == "kPa":
+            return "mm, kPa, mN; RAS coordinates"
+        return f"mm, moduli and stresses as ratios to the modulus of '{self.relative_to}'; RAS coordinates"
 
 
 def fitted_bodies(result: CaseResult) -> tuple[FittedBody, ...]:

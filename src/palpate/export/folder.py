@@ -9,7 +9,7 @@ from palpate.errors import ConfigurationError
 from palpate.export.fitted_model import FittedModel, fitted_model
 from palpate.export.formats import Options, format_named
 from palpate.export.model_file import read_model
-from palpate.study.earlier import seal_of
+from palpate.study.earlier import refuse_any_result, seal_of
 from palpate.study.lock import held_folder
 from palpate.study.outputs import OutputFolder, make_folder
 from palpate.study.result import CaseResult
@@ -30,8 +30,8 @@ def export(
     format: one of `palpate.export.formats.FORMATS`; linear: tetrahedra of four nodes, displacements of corners alone;
     source: a folder with the DICOM series of the first image, which "dicom" refers to. Gives the paths that were
     written, all or none of them. Raises `InputDataError` for a folder that is incomplete, of another version or changed
-    since, `EstimationError` for an estimate that did not converge, `ConfigurationError` for an unknown format,
-    `ResourceError` where a library is missing or the disk refuses.
+    since, `EstimationError` for an estimate that did not converge, `ConfigurationError` for an unknown format or an
+    `output` that holds a result, `ResourceError` where a library is missing or the disk refuses.
     """
     options = Options(linear, None if source is None else Path(source))
     format_named(format)
@@ -50,6 +50,7 @@ def export(
 def export_into(outputs: OutputFolder, model: FittedModel, name: str, options: Options) -> None:
     """Put the files of the format `name` in place in a folder that is held; further pairs' in pair_2, pair_3 ..."""
     form = format_named(name)
+    refuse_any_result(outputs.path)
     with outputs.staged() as staging:
         for number, body in enumerate(model.bodies if form.every_pair else model.bodies[:1], start=1):
             folder = staging.area if number == 1 else make_folder(staging.area / f"pair_{number}")

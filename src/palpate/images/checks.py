@@ -149,12 +149,14 @@ def check_segmentation(segmentation: Segmentation, name: str) -> tuple[Finding, 
                 findings.append(Finding("cut-by-border", text, tissue.name, f"in '{name}' ({share})"))
             findings += _too_thin(segmentation.index == i, box, tissue, name)
             parts, count = ndimage.label(segmentation.index[box] == i, structure=np.ones((3, 3, 3)))
-            if count > 1:
+            whole = max(len(tissue.labels), 1)  # a tissue of a left and a right label has two pieces
+            if count > whole:
                 sizes = np.sort(np.bincount(parts.ravel())[1:])
+                largest = "the largest" if whole == 1 else f"the {whole} largest"
                 text = (
                     f"'{tissue.name}' has {count} separate pieces in '{name}', with"
-                    f" {sizes[:-1].sum() / sizes.sum():.2%} of its volume outside the largest. Remove stray voxels from"
-                    " the labels."
+                    f" {sizes[:-whole].sum() / sizes.sum():.2%} of its volume outside {largest}. Remove stray voxels"
+                    " from the labels."
                 )
                 findings.append(Finding("islands", text, tissue.name, f"in '{name}' ({count})"))
     return tuple(findings)

@@ -99,11 +99,19 @@ def open_input(path: Path) -> InputFile:
         raise FileNotFoundError(errno.ENOENT, f"there is no such file{like(Path(path))}", str(path)) from error
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OSError(errno.EINVAL, "it is a folder, a pipe, a socket or a device, not a file", str(path))
+            raise OSError(errno.EINVAL, f"it is {_kind(Path(path))}", str(path))
         return InputFile(descriptor)
     except BaseException:
         os.close(descriptor)
         raise
+
+
+def _kind(path: Path) -> str:
+    """What is not a regular file, in words; of a folder with a case, the file that is meant."""
+    if not path.is_dir():
+        return "a pipe, a socket or a device, not a file"
+    case = path / "case.toml"
+    return "a folder, not a file" + (f", did you mean '{printable(str(case))}'?" if case.is_file() else "")
 
 
 def followed(path: Path, folder: Path) -> Path | None:

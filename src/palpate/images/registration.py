@@ -16,7 +16,7 @@ from palpate.images.tissue import Role, Tissue
 
 LEAST_MM = 0.01  # no image shows less
 ROUNDING = 1e-3  # mm, degrees: of a motion that a solver finds where there is none
-ON = {"rigid-tissues": "the rigid tissues", "surfaces": "all surfaces that both images show"}
+ON = {"rigid-tissues": "the rigid tissues", "surfaces": "all surfaces that both images have"}
 
 
 @dataclass(frozen=True, slots=True)

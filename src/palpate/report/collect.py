@@ -35,7 +35,7 @@ from palpate.report.report_data import (
     TriangleSurface,
 )
 from palpate.report.stiffness_maps import tissue_maps
-from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, image_surface, model_surface
+from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, image_surface, model_surface, outer_first
 from palpate.report.volume import MOVING, Grey, background, earlier_grey, later_grey, slice_box, whole_box, whole_images
 from palpate.study.case import Case
 from palpate.study.result import CaseResult, MeshSummary, failure_document, stated_unit
@@ -259,10 +259,10 @@ def _surfaces(drawing: _Drawing, image: Segmentation) -> tuple[TriangleSurface, 
     width = smoothing_width(result.before.grid, *(image.grid for image in result.after))  # as the mesh: comparable
     found = []
     shown = SHOWN if result.after else (Role.ESTIMATE, Role.KNOWN)  # of a body that comes as a mesh: all of it
-    for i in sorted(_indices(result, shown), key=lambda i: result.tissues[i].role is Role.RIGID):
+    for i in _indices(result, shown):
         most = RIGID_TRIANGLES if result.tissues[i].role is Role.RIGID else MOST_TRIANGLES
         found.append(image_surface(image, i, smoothing_mm=width, most_triangles=min(most, drawing.most_triangles)))
-    return tuple(surface for surface in found if len(surface.triangles))
+    return outer_first(found)
 
 
 def _later(drawing: _Drawing, after: int, reference: Reference) -> LaterImage:

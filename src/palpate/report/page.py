@@ -252,7 +252,7 @@ def _fields(data: ReportData, k: int, later: LaterImage, planes: Sequence[Plane]
         return tuple(picture_of(p.view.name, partial(draw, data, p, later, name=name)) for p, name in drawn)
 
     if any(tissue.modulus and tissue.role == "estimate" for tissue in data.tissues):
-        words = "Coloured: the organs whose modulus was estimated. A modulus that was given is only marked on the bar."
+        words = "Coloured: the organs whose modulus was estimated. The bar's range includes given moduli."
         yield {
             "of": "stiffness",
             "title": "Young's modulus",

@@ -21,7 +21,7 @@ from palpate.report.report_data import (
     TriangleSurface,
     Volume,
 )
-from palpate.report.surfaces import MOST_TRIANGLES, image_surface
+from palpate.report.surfaces import MOST_TRIANGLES, image_surface, outer_first
 from palpate.report.volume import MOST_VOXELS, Grey, grey_volume, label_volume, slice_box, whole_box
 from palpate.study.first_look import FrameLook, TissueLook
 from palpate.study.imaged import ImagedStates
@@ -116,7 +116,7 @@ def _surfaces(image: Segmentation, most_triangles: int) -> tuple[TriangleSurface
     width = smoothing_width(image.grid)
     shown = [i for i, tissue in enumerate(image.tissues) if tissue.role in SHOWN]
     found = (image_surface(image, i, smoothing_mm=width, most_triangles=most_triangles) for i in shown)
-    return tuple(surface for surface in found if len(surface.triangles))
+    return outer_first(found)
 
 
 def _corners(box: Box) -> NDArray[np.float64]:

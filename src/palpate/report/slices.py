@@ -44,7 +44,7 @@ def first_planes(box: SliceBox) -> tuple[Plane, ...]:
 
 def contour_names(data: ReportData) -> tuple[tuple[str, str], ...]:
     """(name, colour) of every tissue whose contour is drawn."""
-    drawn = dict.fromkeys(surface.tissue for reference in data.references for surface in reference.surfaces)
+    drawn = sorted({surface.tissue for reference in data.references for surface in reference.surfaces})
     return tuple((data.tissues[i].name, data.tissues[i].colour) for i in drawn)
 
 

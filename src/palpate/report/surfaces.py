@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import igl
@@ -18,6 +19,12 @@ from palpate.study.result import CaseResult
 MOST_TRIANGLES = 40_000  # of one surface
 ROOM_MM = 10.0  # around a surface, so that what lies beyond its distance map changes nothing there
 TRIANGLES_A_VOXEL = 2.5  # of marching cubes, for each voxel on the surface
+
+
+def outer_first(surfaces: Iterable[TriangleSurface]) -> tuple[TriangleSurface, ...]:
+    """The surfaces that have triangles, the widest first: of walls that meet, the inner organ's is drawn last."""
+    drawn = [surface for surface in surfaces if len(surface.triangles)]
+    return tuple(sorted(drawn, key=lambda of: -float(np.linalg.norm(np.ptp(of.points, axis=0)))))
 
 
 def image_surface(

@@ -18,6 +18,7 @@ from palpate.steps.saving import save_sensitivity
 from palpate.study import run
 from palpate.study.case import Case
 from palpate.study.check import CheckReport, check_case
+from palpate.study.earlier import refuse_other_result
 from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase
 from palpate.study.null_pair import NullPair, noise_of_drawings
@@ -184,13 +185,15 @@ def sensitivity(
 
     sobol: samples an input of the Sobol indices, a power of 2 (extra `sensitivity`); 0: none. output: a folder for
     sensitivity.json and sensitivity.html, where an interrupted study goes on; None: nothing is written. Raises as
-    `estimate` does, and `NotConverged` where the case itself has no estimate.
+    `estimate` does, `NotConverged` where the case itself has no estimate, and `ConfigurationError` where the folder
+    holds the result of another case.
     """
     if output is None:
         with shown_in_python(progress) as tell:
             return vary(case, sobol=sobol, progress=tell)
     outputs = OutputFolder(Path(output))
     with held_folder(outputs.path), shown_in_python(progress) as tell:
+        refuse_other_result(case, outputs.path)
         found = vary(case, kept=Kept(outputs), sobol=sobol, progress=tell)
         save_sensitivity(found, outputs)
     return found

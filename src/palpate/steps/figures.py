@@ -14,6 +14,7 @@ from palpate.report.collect import collect
 from palpate.report.figures.every import WrittenFigure, write_figures
 from palpate.report.figures.sheet import FORMATS
 from palpate.report.report_data import ReportData
+from palpate.study.earlier import refuse_any_result
 from palpate.study.lock import held_folder
 from palpate.study.outputs import DATA, RESULT, OutputFolder, read_json
 from palpate.study.result import SCHEMA, CaseResult
@@ -61,6 +62,7 @@ def figures_into(
     progress: Progress = silent,
 ) -> tuple[WrittenFigure, ...]:
     """Put all figures in place in a folder that this process holds; raises as `figures` does."""
+    refuse_any_result(outputs.path)
     with outputs.staged() as staging:
         drawn = write_figures(data, staging.area, formats=formats, unit=unit, dpi=dpi, progress=progress)
         staging.commit()

@@ -42,13 +42,8 @@ def refuse_other_case(case: Case, outputs: OutputFolder) -> None:
     A result may be replaced where its case has the same id, patient and first image, or the folder is to be
     overwritten. A case.toml may be replaced that this run or an earlier one has written.
     """
-    there = "" if outputs.overwrite else _other_result(case, outputs.path)
-    if there:
-        raise ConfigurationError(
-            f"{outputs.path} holds the result of another case, {there}; this one is"
-            f" {_named(case.id, case.patient, case)}. Choose another output folder, or replace that result with"
-            " --overwrite (in Python: overwrite=True)"
-        )
+    if not outputs.overwrite:
+        refuse_other_result(case, outputs.path, ", or replace that result with --overwrite (in Python: overwrite=True)")
     path = outputs.path / CASE_NAME
     if CASE_NAME in outputs.written or not path.exists():
         return
@@ -57,6 +52,29 @@ def refuse_other_case(case: Case, outputs: OutputFolder) -> None:
             f"{path} says something else than the case of this run, and is not replaced: choose another --output"
             " folder, or move that file"
         )
+
+
+def refuse_other_result(case: Case, folder: Path, way_out: str = "") -> None:
+    """Raise `ConfigurationError` where the folder holds the result of another case; way_out: what else can be done."""
+    if there := _other_result(case, folder):
+        raise ConfigurationError(
+            f"{folder} holds the result of another case, {there}; this one is {_named(case.id, case.patient, case)}."
+            f" Choose another output folder{way_out}"
+        )
+
+
+def refuse_any_result(folder: Path) -> None:
+    """Raise `ConfigurationError` where the folder holds a result: what is made from results lies elsewhere.
+
+    Exports and figures have files of the names that a result has, such as labels.nii.gz.
+    """
+    try:
+        document = read_json(folder / RESULT)
+    except InputDataError:
+        return
+    if document.get("schema") == SCHEMA:
+        name = shortened(str(document.get("id")))
+        raise ConfigurationError(f"{folder} holds the result of '{name}', which stays alone: choose another --output")
 
 
 def _other_result(case: Case, folder: Path) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding, warning_rows
 from palpate.images.alignment import RigidMotion, fit_rigid_motion, moved, seen_surface, within_border
-from palpate.images.checks import check_pair
+from palpate.images.checks import check_pair, refuse_unit
 from palpate.images.distance import DistanceMap, IsosurfacePoints, observation_width, tissue_distance_map
 from palpate.images.label_image import LabelImage
 from palpate.images.segmentation import Segmentation, segment
@@ -108,11 +108,13 @@ def noise_of_drawings(first: LabelImage, second: LabelImage, *, align: str = "au
 
     align: "surfaces" brings the second image to the first, all organs as one rigid body, which also takes the rigid
     part of the noise out; "none" does not, "auto" only where their grids differ. Raises `ConfigurationError` for any
-    other, `InputDataError` when the images are the same, show no organ that both have, or cannot be of one state
-    (`check_pair`).
+    other, `InputDataError` when an image is in another unit of length, or the images are the same, show no organ that
+    both have, or cannot be of one state (`check_pair`).
     """
     if align not in ALIGNMENTS:
         raise ConfigurationError(f"align is '{align}': {nearest(align, ALIGNMENTS)}")
+    refuse_unit(first.grid, "the first")
+    refuse_unit(second.grid, "the second")
     before, after, left_out = _organs(first, second)
     grids = (before.grid, after.grid)
     alike = grids[0].shape == grids[1].shape and np.allclose(grids[0].affine, grids[1].affine, atol=1e-3)

@@ -40,6 +40,15 @@ class PredictedModulus:
     ratio_interval95: Interval | None = None
 
 
+def _ends(interval: Interval, unit: str) -> str:
+    """An interval in words; an end that is open reaches beyond the bounds of the search."""
+    low, high = interval
+    if low is None or high is None:
+        side = f"below {high:.3g} {unit}" if high is not None else f"above {low:.3g} {unit}" if low is not None else ""
+        return side or "open at both ends"
+    return f"{low:.3g} to {high:.3g} {unit}"
+
+
 @dataclass(frozen=True, slots=True)
 class Prediction:
     """The predicted intervals of a case's moduli, and the noise (mm) that they rest on.
@@ -61,9 +70,8 @@ class Prediction:
             value, interval = of.guess, of.interval95
             if of.verdict == "ratio only" and of.ratio is not None and of.ratio_interval95 is not None:
                 value, interval, unit = of.ratio, of.ratio_interval95, f"times {of.relative_to}"
-            ends = " to ".join("–" if end is None else f"{end:.3g}" for end in interval)
             guess = f"predicted for {of.tissue}, if it has {value:.3g} {unit}"
-            lines.append(f"{guess}: 95 % interval {ends} {unit} ({of.verdict})")
+            lines.append(f"{guess}: 95 % interval {_ends(interval, unit)} ({of.verdict})")
         return lines
 
     def to_dict(self) -> dict[str, Any]:
