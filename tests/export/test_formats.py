@@ -37,7 +37,7 @@ from palpate.mesh.space import lagrange_space
 from palpate.mesh.surface import triangle_normals
 from palpate.mesh.tet_mesh import FACES
 from palpate.report.collect import collect
-from palpate.report.scales import modulus_scale
+from palpate.report.scales import modulus_scale, shown_moduli
 from palpate.study.case import CaseLoad
 from palpate.study.case_loads import loads_on
 
@@ -524,10 +524,24 @@ def test_slicer_shares_unit_limits_and_colours_with_the_report(case_result, tmp_
     assert ("kPa" in scene["name"]) == (verdict == "identified")
     assert scene["range"] == pytest.approx([scale.low, scale.high])
     values = np.unique(np.asarray(nibabel.load(tmp_path / "stiffness.nii.gz").dataobj))
-    shown = np.array([value for value, _ in scale.ticks])
+    shown = shown_moduli(collect(result))
+    shown = np.unique(shown[np.isfinite(shown)])
     np.testing.assert_allclose(values[values > 0], shown, rtol=1e-5)
+    assert scale.low <= shown.min() < shown.max() <= scale.high
     places = np.rint(255 * (shown - scale.low) / (scale.high - scale.low)).astype(int)
     np.testing.assert_allclose(np.array(scene["colours"])[places], scale.colours(shown), atol=0.02)
+
+
+@pytest.mark.parametrize("name", ["abaqus", "febio"])
+def test_a_model_whose_moduli_are_ratios_speaks_of_no_kilopascal(model, tmp_path, name):
+    """Stresses of such a model have the unit of its reference tissue's modulus."""
+    for unit in ("kPa", "ratio"):
+        known = dataclasses.replace(model, unit=unit)
+        folder = tmp_path / unit
+        folder.mkdir()
+        format_named(name).write(known, known.bodies[0], folder)
+        text = "".join(path.read_text() for path in folder.iterdir())
+        assert ("kPa" in text) == (unit == "kPa")
 
 
 def with_mechanics(result, law, loads=()):
