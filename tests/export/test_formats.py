@@ -527,8 +527,21 @@ def test_slicer_shares_unit_limits_and_colours_with_the_report(case_result, tmp_
     moduli = shown_moduli(collect(result))
     shown = np.unique(moduli[np.isfinite(moduli)])
     np.testing.assert_allclose(values[values > 0], shown, rtol=1e-5)
+    assert scale.low <= shown.min() < shown.max() <= scale.high
     places = np.rint(255 * (shown - scale.low) / (scale.high - scale.low)).astype(int)
     np.testing.assert_allclose(np.array(scene["colours"])[places], scale.colours(shown), atol=0.02)
+
+
+@pytest.mark.parametrize("name", ["abaqus", "febio"])
+def test_a_model_whose_moduli_are_ratios_speaks_of_no_kilopascal(model, tmp_path, name):
+    """Stresses of such a model have the unit of its reference tissue's modulus."""
+    for unit in ("kPa", "ratio"):
+        known = dataclasses.replace(model, unit=unit)
+        folder = tmp_path / unit
+        folder.mkdir()
+        format_named(name).write(known, known.bodies[0], folder)
+        text = "".join(path.read_text() for path in folder.iterdir())
+        assert ("kPa" in text) == (unit == "kPa")
 
 
 def with_mechanics(result, law, loads=()):

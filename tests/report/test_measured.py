@@ -144,7 +144,7 @@ def test_the_page_shows_them_and_says_how(measured):
     words = page[: page.index("<script>")]
     for layer in ("layer-seen", "layer-fitted"):
         assert words.count(f'class="{layer}"') >= 3
-    assert re.search(r"\d+ of the 3000 points of displacement-field are drawn, evenly spread", words)
+    assert re.search(r"\d+ of the 3000 points of displacement-field are drawn: evenly spread", words)
     assert "times as long as the motion" in words
     assert "landmarks 70 %, surface distance 20 %, what was believed before 10 %" in re.sub(
         r"<[^>]+>|\s+(?=,)", "", re.sub(r'<span class="swatch"[^>]*></span>', "", words)
