@@ -10,7 +10,7 @@ import termios
 import numpy as np
 import pytest
 
-from palpate.cli.outcome import MOST_LETTERS, columns
+from palpate.cli.outcome import MOST_LETTERS, columns, estimates_table
 from palpate.images.alignment import RigidMotion
 from palpate.images.registration import Registration, length_text
 from palpate.report.tornado import TornadoRow, effect_text
@@ -56,6 +56,20 @@ def test_a_setting_without_an_estimate_says_why_in_the_table():
     )
     assert effect_text(row, reasons=True) == "linear: +10.5 %, mooney-rivlin: no equilibrium was found"
     assert effect_text(row) == "linear: +10.5 %, mooney-rivlin: no estimate"
+
+
+@pytest.mark.parametrize(
+    ("given", "error"), [(10.0, "gland +20 %"), (None, None)], ids=["known reference", "no reference"]
+)
+def test_a_ratio_is_held_against_the_true_ratio(given, error):
+    """Not against the true modulus: 3.6 times 10 kPa is a fifth more than 30 kPa."""
+    gland = {"tissue": "gland", "parameter": "youngs_modulus", "unit": "ratio", "relative_to": "rest", "value": None}
+    gland |= {"interval95": None, "ratio": 3.6, "ratio_interval95": [2.0, 6.0], "verdict": "ratio only", "truth": 30.0}
+    case = {"tissues": {"rest": {"youngs_modulus_kpa": given}}}
+    table = estimates_table({"status": "converged", "estimates": [gland], "warnings": [], "case": case})
+    assert ("error against the truth" in table) == (error is not None)
+    assert error is None or error in table
+    assert "-88 %" not in table
 
 
 def test_a_length_that_no_image_shows_is_not_printed():

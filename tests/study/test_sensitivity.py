@@ -91,7 +91,7 @@ def interrupted(case_file, tmp_path_factory):
 
     def until(problem, settings, *, progress, **rule):
         calls.append((len(settings.starts), rule))
-        if len(calls) == 3:
+        if len(calls) == 4:  # after the case, the case again, and a variant
             raise KeyboardInterrupt
         return real(problem, settings, progress=progress, **rule)
 
@@ -138,6 +138,7 @@ def row_of(document, cause, subject="", setting=None):
 def test_a_study_goes_on_where_it_was_interrupted(interrupted):
     folder, document, told = interrupted
     assert sorted(path.name.rsplit("-", 1)[0] for path in (folder / "variants").iterdir()) == [
+        "as-it-is",
         "edge-length",
         "estimate-sobol-8",
         "law-neo-hookean",
@@ -152,6 +153,15 @@ def test_a_study_goes_on_where_it_was_interrupted(interrupted):
     assert {k: v for k, v in written.items() if k not in ("files", "seconds")} == {
         k: v for k, v in document.items() if k != "seconds"
     }
+
+
+def test_an_assumption_that_is_not_changed_changes_nothing(case_file, monkeypatch):
+    """Though an estimate from where another one ended moves on by a part of its standard deviation."""
+    case = read_case(case_file)
+    same = study.Variant("same", "outer_boundary", "as it is", case)
+    monkeypatch.setattr(study, "variants_of", lambda *_: iter([same]))
+    found = palpate.sensitivity(case, progress=None).to_dict()
+    assert row_of(found, "outer_boundary")["changes"] == {GLAND: pytest.approx(0.0, abs=1e-12)}
 
 
 def test_another_case_takes_nothing_from_it(case_file):

@@ -12,7 +12,7 @@ from scipy import sparse
 
 from palpate.approximation.contract import LinearisationPoint, ModelError, determined
 from palpate.mechanics.forward import SolveCounts
-from palpate.mechanics.linear_model import LinearModel, LinearSystem
+from palpate.mechanics.linear_model import LinearModel, LinearSystem, of_same_body
 from palpate.mechanics.reduced import Projection, ReducedModel, projection
 from palpate.mechanics.solvers.conjugate_gradients import Product, conjugate_gradients, times
 from palpate.mechanics.solvers.contract import Factorisation
@@ -90,9 +90,9 @@ class ReducedBasis:
         far = FAR if at.directions is not None else FAR_ALONE
         # a solver that iterates is no preconditioner; for many right-hand sides a new factorisation pays
         if many or not direct or ratios.max() >= far * ratios.min():
-            there = [other.system for other in others if other.serves(model, at.moduli)]
-            near = there[0].of(model) if there else model.system(at.moduli)
-            sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=int(not there)))
+            shared = of_same_body(model, at.moduli, (other.system for other in others))
+            near = shared or model.system(at.moduli)
+            sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=int(not shared)))
         displacement, along = self._homogeneous(at), _Directions.at(at, model, every=every)
         product = partial(model.free_forces, at.moduli)
         new = int(not at.same_as(self.place))  # whether the displacement is solved for, too
@@ -117,10 +117,6 @@ class ReducedBasis:
             sharper = sharper.with_material(responses, at.moduli if every else self.material_at)
             sharper = _extended(replace(sharper, place=at), missing[:, :last], cost)
         return sharper
-
-    def serves(self, model: LinearModel, moduli: NDArray[np.float64]) -> bool:
-        """Whether its last factorisation is that of another state's model at moduli (n_regions,) kPa."""
-        return model.same_stiffness(self.full_model) and np.array_equal(self.system.moduli, moduli)
 
     @property
     def error_counts(self) -> SolveCounts:

@@ -32,8 +32,10 @@ class Outcome:
 
 def estimates_table(document: Mapping[str, Any]) -> str:
     """The estimates of a result as aligned columns, what its maps say, and its note."""
-    from palpate.report.rows import NONE, expected_share, interval_text, main_numbers, moduli_in, number, ratio_rows
+    from palpate.report.rows import NONE, expected_share, interval_text, moduli_in, number, ratio_rows
+    from palpate.report.units import shown_unit
 
+    shown = shown_unit(document)
     rows = [["tissue", "Young's modulus", "95 % interval", "ratio", "verdict", "truth"]]
     missed = any(warning["code"] == "data-misfit" for warning in document["warnings"])
     for item in moduli_in(document):
@@ -50,7 +52,7 @@ def estimates_table(document: Mapping[str, Any]) -> str:
                 interval_text(interval) + (unit if interval else ""),
                 f"{ratio} to {item['relative_to']}" if item["ratio"] is not None else "–",
                 item["verdict"] + (", but data are missed" if missed and item["verdict"] != "not identified" else ""),
-                number(item["truth"]),
+                number(shown.truth(item)),
             ]
         )
     if all(row[-1] == "–" for row in rows[1:]):
@@ -59,9 +61,9 @@ def estimates_table(document: Mapping[str, Any]) -> str:
     more = [columns([["tissue", "Poisson's ratio", "95 % interval", "verdict"], *ratios])] if ratios else []
     far = []
     for item in moduli_in(document):
-        found, ends = main_numbers(item)
-        if found and item["truth"] and (share := expected_share(found, ends, item["truth"])) != NONE:
-            error = f"{100.0 * (found / item['truth'] - 1.0):+.0f} %"
+        (found, ends), truth = shown.numbers(item), shown.truth(item)
+        if found and truth and (share := expected_share(found, ends, truth)) != NONE:
+            error = f"{100.0 * (found / truth - 1.0):+.0f} %"
             far.append(f"{item['tissue']} {error} ({share} of estimates with this interval are off by as much or more)")
     more += [f"error against the truth: {', '.join(far)}"] if far else []
     maps = [item["words"] for item in document.get("maps", ())]

@@ -24,7 +24,7 @@ from palpate.inversion.optimise import Bounds, Minimum, grouped, same_minimum
 from palpate.inversion.trust_region import NEAR, OuterIterate, begun, fit_coefficients, minimised
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
-from palpate.mechanics.linear_model import LinearModel, LinearSystem
+from palpate.mechanics.linear_model import LinearModel, LinearSystem, of_same_body
 from palpate.mechanics.reduced import free_combinations
 from palpate.progress import Progress
 from palpate.unknowns.blocks import Acts, Block
@@ -147,12 +147,11 @@ def _responses(model: LinearModel, moduli: NDArray[np.float64], others: Sequence
 
     States of one body with the same modes differ in offset and loads alone: one right-hand side.
     """
-    for other in others:
-        like = other.system.model
-        if model.same_stiffness(like) and model.constraint.modes is like.constraint.modes:
-            system = other.system.of(model)
-            alone = system.solve(np.zeros(model.n_modes)).values.astype(np.float32)
-            return _Responses(system, other.boundary, alone, SolveCounts(forward=1))
+    alike = (other for other in others if other.system.model.constraint.modes is model.constraint.modes)
+    for other in alike:
+        if shared := of_same_body(model, moduli, [other.system]):
+            alone = shared.solve(np.zeros(model.n_modes)).values.astype(np.float32)
+            return _Responses(shared, other.boundary, alone, SolveCounts(forward=1))
     system = model.system(moduli)
     responses = system.single_responses(tolerance=SNAPSHOT)
     return _Responses(system, responses[:, :-1], responses[:, -1], system.response_counts)

@@ -7,6 +7,7 @@ K_ff z = F^T f - F^T K (M q + o) with K_ff = F^T K F and dead loads f.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -365,6 +366,17 @@ class LinearEquilibrium(DenseEquilibrium):
         result, first = np.concatenate([by_boundary, by_material]), model.n_regions
         result[first : first + constraint.n_modes] += constraint.modes.T @ gradient
         return result
+
+
+def of_same_body(
+    model: LinearModel, moduli: NDArray[np.float64], others: Iterable[LinearSystem]
+) -> LinearSystem | None:
+    """The system of a state's model at moduli (n_regions,) kPa by the factorisation of another state of its body.
+
+    None where none of the `others` is one, or is of other moduli.
+    """
+    same = (other for other in others if model.same_stiffness(other.model) and np.array_equal(other.moduli, moduli))
+    return next((other.of(model) for other in same), None)
 
 
 def poisson_tangents(equilibrium: LinearEquilibrium, dilatation: Dilatation) -> NDArray[np.float64]:

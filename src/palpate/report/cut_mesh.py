@@ -89,10 +89,7 @@ def element_moduli(data: ReportData) -> NDArray[np.float64]:
 def motion_of(later: LaterImage) -> NDArray[np.float64]:
     """The fitted motion (n_nodes, 3) mm of the mesh's nodes; raises `ValueError` where none is kept."""
     if not len(later.motion):
-        raise ValueError(
-            "no motion of the mesh is kept for this image; data of an older version of Palpate have none: run the"
-            " estimate again"
-        )
+        raise ValueError("no motion of the mesh is kept for this image; run the estimate again")
     return later.motion.astype(np.float64)
 
 

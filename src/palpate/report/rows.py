@@ -253,13 +253,6 @@ def scale_marks(document: Mapping[str, Any]) -> tuple[tuple[float, str], ...]:
     return tuple((BAR * (math.log(n) - scale[0]) / (scale[1] - scale[0]), mark_text(n)) for n in marks)
 
 
-def main_numbers(item: Mapping[str, Any]) -> tuple[float | None, Interval | None]:
-    """The number that the tissue is judged by: kPa, or the ratio where there is no kPa."""
-    if item["value"] is not None:
-        return item["value"], item["interval95"]
-    return item["ratio"], item["ratio_interval95"]
-
-
 def interval_text(interval: Interval | None) -> str:
     """As "2.00 to 5.00"; "> 2.00" or "< 5.00" with one end open, "any" with both; a dash for nothing."""
     if interval is None:

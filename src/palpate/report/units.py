@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from palpate.study.stiffness_scale import modulus_label
 from palpate.uncertainty import NORMAL_95, Interval
 from palpate.unknowns import KNOWN_MODULUS
 
 UnitName = Literal["kPa", "ratio"]
-LETTERS = 24  # of a tissue's name on an axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +35,7 @@ class ModulusUnit:
     @property
     def axis(self) -> str:
         """The label of an axis or a colour bar: "Young's modulus (kPa)", or "E / E of surroundings (ratio)"."""
-        quantity = "Young's modulus (kPa)"
-        return quantity if self.name == "kPa" else f"E / E of {self.relative_to[:LETTERS]} (ratio)"
+        return modulus_label(self.name, self.relative_to)
 
     def numbers(self, item: Mapping[str, Any]) -> tuple[float | None, Interval | None]:
         """Value and 95 % interval of an entry of "estimates", in this unit; None where there is none."""

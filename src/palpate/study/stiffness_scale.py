@@ -34,9 +34,7 @@ class StiffnessScale:
     @property
     def label(self) -> str:
         """What stands beside the colours."""
-        if self.unit == "kPa":
-            return "Young's modulus (kPa)"
-        return f"E / E of {self.relative_to[:LETTERS]} (ratio)"
+        return modulus_label(self.unit, self.relative_to)
 
     def linear_table(self) -> NDArray[np.float64]:
         """256 colours (256, 3), 0 to 1, at equal steps of the modulus from `low` to `high`.
@@ -46,6 +44,11 @@ class StiffnessScale:
         values = np.linspace(self.low, self.high, 256)
         place = np.log(values / self.low) / math.log(self.high / self.low)
         return np.asarray(mpl.colormaps[COLOURS](place)[:, :3])
+
+
+def modulus_label(unit: str, relative_to: str) -> str:
+    """What an axis or a colour bar of moduli is called, in "kPa" or as a "ratio" to the tissue `relative_to`."""
+    return "Young's modulus (kPa)" if unit == "kPa" else f"E / E of {relative_to[:LETTERS]} (ratio)"
 
 
 def stiffness_scale(

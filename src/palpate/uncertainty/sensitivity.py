@@ -29,7 +29,7 @@ from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, finite_strain_model
 from palpate.mechanics.hyperelastic import elements_of
 from palpate.mechanics.laws.contract import Law
-from palpate.mechanics.linear_model import LinearEquilibrium, LinearSystem, poisson_tangents
+from palpate.mechanics.linear_model import LinearEquilibrium, LinearSystem, of_same_body, poisson_tangents
 from palpate.mechanics.newton import NewtonSettings
 from palpate.observation.contract import Imaged, OfMaterial, seen_by
 from palpate.uncertainty.profile import PASSES, refitted
@@ -123,8 +123,8 @@ def exact_equilibria(objective: Objective, unknowns: NDArray[np.float64]) -> Equ
         if isinstance(of, Expansion):
             found.append(of.equilibrium)
             continue
-        same = [system for system in systems if state.model.same_stiffness(system.model)]
-        systems.append(same[0].of(state.model) if same else state.model.system(place.moduli))
+        shared = of_same_body(state.model, place.moduli, systems)
+        systems.append(shared or state.model.system(place.moduli))
         found.append(systems[-1].solve(place.coefficients))
     return tuple(found)
 

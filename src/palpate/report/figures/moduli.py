@@ -17,7 +17,6 @@ from palpate.report.units import ModulusUnit, UnitName, shown_unit
 GREY = "#888888"
 ROOM = 1.6  # by which factor the axis reaches beyond all numbers, for the arrows of open ends
 ROW_MM, FRAME_MM = 11.0, 15.0
-UNITS = ("kPa", "ratio")
 
 
 def chosen_unit(document: Mapping[str, Any], name: str | None) -> ModulusUnit:
