@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from palpate.errors import ResourceError
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.study.outputs import write_bytes
-from palpate.study.samples import CHAINS, POSTERIOR
+from palpate.study.samples import POSTERIOR
 
 DRAWS = 1000
 SEED = 0

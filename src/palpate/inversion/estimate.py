@@ -1,22 +1,25 @@
-"""From models and observations to the moduli that explain the later images: start, starts, continuation, comparison."""
+"""From models and observations to the moduli that explain the later images: start, search, starts, the case's law."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.approximation.expansion import Expansion, coarse_equilibrium, expansion_around
 from palpate.errors import ConfigurationError
-from palpate.inversion.candidates import Inversion, concluded
-from palpate.inversion.continuation import continued
-from palpate.inversion.later_state import InverseProblem
-from palpate.inversion.objective import Objective
-from palpate.inversion.optimise import Bounds, Minimum
-from palpate.inversion.starts import from_starts, informed_start
-from palpate.inversion.trust_region import NEAR, REPORTED, StopRule, minimised
+from palpate.inversion.later_state import InverseProblem, LaterState
+from palpate.inversion.mixture import Mixture
+from palpate.inversion.objective import Evaluation, Objective
+from palpate.inversion.optimise import Bounds, Minimum, same_minimum
+from palpate.inversion.search import REPORTED, ROUGH, Searched, StopRule, begun, searched
+from palpate.inversion.starts import StartRun, informed_start, started
+from palpate.mechanics.forward import SolveCounts
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Line, Progress, during
+
+EQUILIBRIUM = 1e-5  # relative residual of the forces while the estimate still moves
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +45,23 @@ class InversionSettings:
         return np.clip(0.5 * (self.bounds.lower + self.bounds.upper), starts.min(axis=0), starts.max(axis=0))
 
 
+@dataclass(frozen=True, slots=True)
+class Inversion:
+    """The posterior, every start, and the evaluation at no motion (`rest`).
+
+    objective: that of the likeliest explanation, with its approximations and noise models; minimum: all unknowns at the
+    posterior's mean of theta, with their evaluation, the outcome, and the way there. evaluations, counts: what it cost.
+    """
+
+    objective: Objective
+    minimum: Minimum
+    mixture: Mixture
+    starts: tuple[StartRun, ...]
+    rest: Evaluation
+    evaluations: int
+    counts: SolveCounts
+
+
 @blas_on_one_thread()
 def invert(
     problem: InverseProblem, settings: InversionSettings, *, progress: Progress, rule: StopRule = REPORTED
@@ -50,23 +70,60 @@ def invert(
 
     States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle of the
     bounds and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows
-    ends near. At last blocks that were fixed are free, see `ended`.
-    Raises `ConfigurationError` for an unknown Poisson's ratio with another law, `EstimationError`s of solving; an
-    estimate that did not converge says so in its minimum's outcome.
+    ends near. Other minima, to which starts lead, are among what is compared. Raises `ConfigurationError` for an
+    unknown Poisson's ratio with another law, `EstimationError`s of solving; an estimate that did not converge says so
+    in its minimum's outcome.
     """
     if problem.finite_strain and problem.parameters.poisson:
         raise ConfigurationError(
             "a Poisson's ratio can be estimated under the linear law only, as finite-strain models keep those of the"
             " tissues; estimate none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
         )
-    bounds = settings.bounds
-    minima, runs, rest = from_starts(problem, settings.centre, settings.every_start, bounds, progress=progress)
-    if problem.finite_strain:
-        best = minima[0].objective.parameters.in_words(minima[0].minimum.unknowns)
+    bounds, n = settings.bounds, problem.parameters.n_parameters
+    start = informed_start(problem, settings.centre, progress=progress)
+    nothing = np.zeros(len(start.minimum.unknowns))
+    rest = start.objective.rematched(nothing)(nothing)
+    finite = problem.finite_strain
+    near = searched(start, bounds, ROUGH if finite else rule, progress=progress, title="linear law")
+    progress(f"{len(settings.every_start)} starts, with the closest points there")
+    runs = started(near.cheapest(), near.minimum.unknowns, settings.every_start, bounds)
+    others = [
+        run.minimum.unknowns
+        for i, run in enumerate(runs)
+        if run.minimum.converged
+        and not same_minimum(run.minimum.unknowns, near.posterior.minimum, n)
+        and run.candidate not in [other.candidate for other in runs[:i]]
+    ]
+    if finite:
+        best = near.objective.parameters.in_words(near.minimum.unknowns)
         progress(Line(f"{best} by the linear law; now at finite strain", "check the law"))
-        progress = during("check the law", progress)
-    ends = continued(minima, bounds, rule=rule, progress=progress)
-    return concluded(ends, runs, rest, bounds)
+        near = at_finite_strain(near, progress=during("check the law", progress))
+    end = near
+    if finite or others:
+        title = "finite strain" if finite else "linear law, other minima too"
+        end = searched(near, bounds, rule, progress=progress, title=title, begins=others)
+    if finite and end.minimum.converged:
+        progress("finite strain: the exact equilibrium at the estimate")
+        end = end.at_equilibrium()
+    return Inversion(end.objective, end.minimum, end.posterior, runs, rest, 1 + end.minimum.evaluations, end.counts)
+
+
+def at_finite_strain(near: Searched, *, progress: Progress) -> Searched:
+    """Where a search under the linear law goes on: at expansions of its states' `finite_strain` models.
+
+    Far from there the states bend as the linear law's reduced bases do. Raises as `invert` does.
+    """
+    progress("finite strain: the equilibrium at the linear estimate")
+    before, at = near.objective, near.minimum
+    expansions, states = list[Expansion](), list[LaterState]()
+    points = before.linearisation_points(at.unknowns)
+    for state, basis, point in zip(before.states, before.approximations, points, strict=True):
+        assert state.finite_strain is not None
+        coarse = coarse_equilibrium(state.finite_strain, basis, point)
+        expansions.append(expansion_around(coarse, tolerance=EQUILIBRIUM, progress=progress))
+        states.append(replace(state, approximation=None, bending=basis))
+    objective = replace(before, states=tuple(states)).under(expansions)
+    return begun(objective, at.unknowns, history=at.history, evaluations=at.evaluations)
 
 
 @blas_on_one_thread()
@@ -78,5 +135,5 @@ def first_noise_of(
     Its minimum is the first one, and no estimate: no start was tried. Raises as `invert` does.
     """
     start = informed_start(problem.linear(), settings.centre, progress=progress)
-    nearby = minimised(start, settings.bounds, NEAR, progress=progress, title="the first minimum")
+    nearby = searched(start, settings.bounds, ROUGH, progress=progress, title="the first minimum")
     return nearby.objective, nearby.minimum

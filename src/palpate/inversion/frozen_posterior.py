@@ -8,18 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError
-from palpate.inversion.objective import AS_GOOD, Evaluation, Linearisation, Objective
-from palpate.inversion.optimise import Bounds, LeastSquares, Minimum, gauss_newton
+from palpate.inversion.objective import Evaluation, Linearisation, Objective
+from palpate.inversion.optimise import LeastSquares
 from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.reduced import ReducedModel
-from palpate.parallel import mapped
+from palpate.unknowns.parameters import ParameterMap
 
 ONE = np.ones(1)  # the coordinate of what no unknown moves
 
@@ -46,6 +47,11 @@ class FixedCorrespondence:
         """Number of log-moduli among the unknowns."""
         return self.objective.n_parameters
 
+    @property
+    def parameters(self) -> ParameterMap:
+        """The unknowns with their prior."""
+        return self.objective.parameters
+
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J at `unknowns` (n_unknowns,) with score and Gauss-Newton matrix; raises `SolverError`."""
         mapping, found = self.objective.parameters, list[Linearisation]()
@@ -64,6 +70,10 @@ class FixedCorrespondence:
                 residuals = replace(term.residuals, values=values)
                 found.append(Linearisation.of(term.observation, s, residuals, term.columns, jacobian, term.weights))
         return self.assembled(unknowns, found)
+
+    def believing(self, parameters: ParameterMap) -> FixedCorrespondence:
+        """The same under another prior of its unknowns."""
+        return replace(self, objective=self.objective.believing(parameters))
 
     def assembled(self, unknowns: NDArray[np.float64], linearisations: Sequence[Linearisation]) -> Evaluation:
         """J at `unknowns` (n_unknowns,) where its linearisations there are known."""
@@ -139,38 +149,30 @@ class FrozenState:
 class FrozenPosterior:
     """Minus log-posterior 1/2 sum_s z_s^T Q_s z_s + 1/2 (x - m)^T P (x - m), dimensionless, of unknowns x (n,).
 
-    z_s: see `FrozenState`; prior: P (n, n).
+    z_s: see `FrozenState`; m, P: those of `parameters`.
     """
 
-    objective: Objective
+    parameters: ParameterMap
     states: tuple[FrozenState, ...]
-    prior: NDArray[np.float64]
 
     @property
     def n_parameters(self) -> int:
         """Number of log-moduli among the unknowns."""
-        return self.objective.n_parameters
+        return self.parameters.n_parameters
 
-    def value(self, unknowns: NDArray[np.float64]) -> float:
-        """Its value alone at unknowns (n,); raises `SolverError` where a reduced stiffness is not positive definite."""
-        parameters = self.objective.parameters
-        moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
-        total = 0.5 * float(away @ self.prior @ away)
-        for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
-            amplitude = state.reduced.amplitude(moduli, np.append(coefficients[: state.reduced.n_boundary], ONE))
-            z = state.coordinates(amplitude, moduli, coefficients, parameters.offsets(unknowns, s))
-            total += 0.5 * float(z @ (state.form @ z))
-        return total
+    def believing(self, parameters: ParameterMap) -> FrozenPosterior:
+        """The same under another prior of its unknowns."""
+        return replace(self, parameters=parameters)
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """Its value, score and Gauss-Newton matrix at unknowns (n,), without residuals; raises `SolverError`.
 
         With D_s = d z_s / dx the score is sum_s D_s^T Q_s z_s + P (x - m), the matrix sum_s D_s^T Q_s D_s + P.
         """
-        parameters = self.objective.parameters
+        parameters, prior = self.parameters, self.parameters.prior_matrix
         moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
-        pull, modulus_slopes = self.prior @ away, parameters.derivatives(unknowns)
-        value, score, matrix, misfit = 0.5 * float(away @ pull), pull.copy(), self.prior.copy(), 0.0
+        pull, modulus_slopes = prior @ away, parameters.derivatives(unknowns)
+        value, score, matrix, misfit = 0.5 * float(away @ pull), pull.copy(), prior.copy(), 0.0
         for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
             there, own = state.reduced.solve(moduli, coefficients), parameters.unknowns_of(s)
             z = state.coordinates(there.amplitude, moduli, coefficients, parameters.offsets(unknowns, s))
@@ -180,7 +182,7 @@ class FrozenPosterior:
             score[own] += state.transposed_times(force[:, None], amplitude_slopes, modulus_slopes)[:, 0]
             halfway = state.transposed_times(state.form, amplitude_slopes, modulus_slopes)
             matrix[np.ix_(own, own)] += state.transposed_times(halfway.T, amplitude_slopes, modulus_slopes)
-        return Evaluation(value, misfit, score, matrix, (), self.prior, pull, parameters.images)
+        return Evaluation(value, misfit, score, matrix, (), prior, pull, parameters.images)
 
 
 def frozen_posterior(
@@ -230,22 +232,25 @@ def frozen_posterior(
             form += term.precision * own
             square += own / len(evaluation.linearisations)
         states.append(replace(bare, form=form, square=square))
-    return FrozenPosterior(objective, tuple(states), evaluation.prior)
+    return FrozenPosterior(parameters, tuple(states))
 
 
-def cheapest_minima(
-    objective: Objective,
-    unknowns: NDArray[np.float64],
-    evaluation: Evaluation,
-    begins: Sequence[NDArray[np.float64]],
-    bounds: Bounds,
-) -> list[Minimum]:
-    """The minimum from each of the `begins` (n,), closest points and hyper-parameters those of an evaluation.
+class Posterior(LeastSquares, Protocol):
+    """Minus the log posterior of all unknowns, under a prior that can be replaced."""
 
-    Of the frozen posterior; where the objective's models are no reduced ones, of what only has the former.
-    """
+    @property
+    def parameters(self) -> ParameterMap:
+        """The unknowns with their prior."""
+        ...
+
+    def believing(self, parameters: ParameterMap) -> Posterior:
+        """The same under another prior of its unknowns."""
+        ...
+
+
+def cheapest_posterior(objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation) -> Posterior:
+    """The objective with the closest points and weights of an evaluation: frozen, where its models are reduced ones."""
     try:
-        cheapest: LeastSquares = frozen_posterior(objective, unknowns, evaluation)
+        return frozen_posterior(objective, unknowns, evaluation)
     except ConfigurationError:
-        cheapest = fixed_correspondence(objective, unknowns, evaluation)
-    return mapped(lambda begin: gauss_newton(cheapest, begin, bounds=bounds, tolerance=AS_GOOD / 200.0), begins)
+        return fixed_correspondence(objective, unknowns, evaluation)

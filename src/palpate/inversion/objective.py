@@ -8,28 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from palpate.approximation.contract import Approximation, LinearisationPoint, determined
-from palpate.inversion.by_image import Images, among, log_determinant, solve_by_image
+from palpate.inversion.by_image import Images, among, solve_by_image
 from palpate.inversion.later_state import LaterState
 from palpate.mechanics.forward import Equilibrium
 from palpate.observation.contract import Observation, OfMaterial, Rematched, Residuals
 from palpate.observation.jacobian import Jacobian, jacobian_of
 from palpate.parallel import mapped
 from palpate.unknowns.parameters import ParameterMap
-
-DRIVER_LN_SD = float(np.log(2.0))  # standard deviation of ln of a driver's scale over that of its kind
-AS_GOOD = 1.92  # of minus the log posterior: half the 95 % quantile of chi-squared with one degree of freedom
-
-
-def as_good(value: float, best: float, *, scale: float = 1.0) -> bool:
-    """Whether a minimum of a `value` of minus the log posterior is as likely as one of `best`, as far as data can say.
-
-    By the rule of a 95 % interval: twice their difference, times a `scale` of the deviance (see `Profile`), is below
-    1.96^2. A difference does not depend on how many residuals make it up.
-    """
-    return scale * (value - best) < AS_GOOD
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +106,19 @@ class Evaluation:
         with determined():
             return solve_by_image(self.matrix, np.eye(len(self.matrix))[:, :n_parameters], self.images)
 
+    def under(self, parameters: ParameterMap, unknowns: NDArray[np.float64]) -> Evaluation:
+        """The same at `unknowns` (n_unknowns,), where it is of, under another prior of these."""
+        value, pull = _prior(parameters, unknowns)
+        before, prior = 0.5 * float(self.prior_score @ (unknowns - parameters.prior_centre)), parameters.prior_matrix
+        return replace(
+            self,
+            value=self.value - before + value,
+            score=self.score - self.prior_score + pull,
+            matrix=self.matrix - self.prior + prior,
+            prior=prior,
+            prior_score=pull,
+        )
+
     def of_those(self, kept: NDArray[np.bool_]) -> Evaluation:
         """The same matrix and score of the unknowns that are `kept` (n,) alone, without residuals."""
         within, images = np.ix_(kept, kept), among(self.images, kept)
@@ -128,69 +128,25 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True)
 class Objective:
-    """Minus the log posterior of unknowns x and hyper-parameters h, over all observations k of all later states.
+    """J, minus the log posterior of all unknowns x under one prior, over all observations k of all later states.
 
-    J(x, h) = sum_k n_k sum_j w_j (rho_k(r_j) / (2 s_k^2) + ln Z_k(s_k)) + 1/2 (x - m)^T P (x - m) - 1/2 ln det P
-    - ln p(h) + 1/2 ln det H. The unknowns x, their prior mean m and precision P are those of `parameters`. h: the
-    scales s_k of the observations' `weighting`, the blocks' covariance P^-1, and the numbers of the alternatives
-    that are `chosen` for them, with their odds as p(h); the last term integrates over x by Laplace's approximation, H =
-    J^T W J + P. A call gives what depends on x at these h, `total` all of it. Each observation has an offset, where
-    `parameters` have one. learn_last: whether the blocks that are learned last have a choice yet.
+    J(x) = sum_k n_k sum_j w_j rho_k(r_j(x)) / (2 s_k^2) + 1/2 (x - m)^T P (x - m), but for a constant. The unknowns x,
+    their prior mean m and precision P are those of `parameters`; scales s_k and numbers n_k of independent residuals
+    are those of the observations' `weighting`. Each observation has an offset, where `parameters` have one.
     """
 
     states: tuple[LaterState, ...]
     parameters: ParameterMap
-    chosen: tuple[int | None, ...] = ()
-    learn_last: bool = False
 
     @property
     def n_parameters(self) -> int:
         """Number of log-moduli among the unknowns."""
         return self.parameters.n_parameters
 
-    def total(self, evaluation: Evaluation) -> float:
-        """J, dimensionless, where it was evaluated: with ln Z of the residuals, ln det P, ln p(h), ln det H."""
-        pairs = zip(self.parameters.blocks, self.chosen, strict=False)
-        odds = [block.odds[c] for block, c in pairs if block.odds and c is not None]
-        odds += [min((block.released_odds for block in self.parameters.blocks if not block.released), default=0.0)]
-        residuals = sum(o.weighting.log_normaliser for o in self.observations)
-        for state in self.states:
-            kinds = {o.kind: o.weighting.sd for o in state.observations if not o.of_driver}
-            drivers = [o for o in state.observations if o.of_driver and o.kind in kinds]
-            residuals += sum(worse_driver(o.weighting.sd, kinds[o.kind]) for o in drivers)
-        normal, beyond = self.as_normal(evaluation)
-        n = self.n_parameters
-        images = self.parameters.images
-        posterior = log_det(evaluation.matrix - evaluation.prior + normal, images)
-        determinants = posterior - log_det(normal[n:, n:], tuple(own - n for own in images))
-        return evaluation.value + (residuals + beyond - sum(odds) + 0.5 * determinants)
-
-    def as_normal(self, evaluation: Evaluation) -> tuple[NDArray[np.float64], float]:
-        """Precision P (n_unknowns, n_unknowns) for the determinants; what J has beside the normal laws of `parameters`.
-
-        A total variation counts as it is where it was evaluated, and in the determinants as the normal law with which
-        it begins: its curvature has edges, which no smooth function of x follows.
-        """
-        normal, beyond = evaluation.prior, 0.0
-        for i, block in enumerate(self.parameters.blocks):
-            if block.variation:
-                own = self.parameters.columns(i)
-                away = linalg.solve(normal[np.ix_(own, own)], evaluation.prior_score[own], assume_a="pos")
-                x = self.parameters.prior_centre[own] + away
-                beyond += block.variation.value(x) - 0.5 * float(away @ evaluation.prior_score[own])
-                normal = normal.copy()
-                normal[np.ix_(own, own)] = block.precision
-        return normal, beyond
-
     @property
     def observations(self) -> list[Observation]:
         """Those of all states, one state after the other."""
         return [observation for state in self.states for observation in state.observations]
-
-    @property
-    def n_independent(self) -> float:
-        """Number of independent residuals of all observations."""
-        return sum(o.weighting.count for o in self.observations)
 
     @property
     def approximations(self) -> list[Approximation]:
@@ -205,24 +161,22 @@ class Objective:
         return [state.bending or model for state, model in zip(self.states, self.approximations, strict=True)]
 
     def linearisation_points(
-        self, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None, *, all_material: bool = True
+        self, unknowns: NDArray[np.float64], evaluations: Sequence[Evaluation] = (), *, all_material: bool = True
     ) -> list[LinearisationPoint]:
-        """What unknowns (n_unknowns,) mean for each state; by an `evaluation` with the directions that decide there.
+        """What unknowns (n_unknowns,) mean for each state; with the directions that decide, by `evaluations` there.
 
-        all_material: whether derivatives by all material modes are asked for, too.
+        These are of one or more priors; the first one's matrix is the metric. all_material: whether derivatives by all
+        material modes are asked for, too.
         """
-        mapping = self.parameters
+        mapping, n = self.parameters, self.n_parameters
         moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)
-        if evaluation is None:
+        if not evaluations:
             return [LinearisationPoint(moduli, q) for q in coefficients]
-        directions, points = deciding_directions(evaluation, mapping.n_parameters), []
-        if any(block.released for block in mapping.blocks):  # also the directions that decide with these blocks free
-            _, free = self.released(evaluation, unknowns)
-            more = deciding_directions(free, mapping.n_parameters)[:, mapping.n_parameters :]
-            directions = np.concatenate([directions, more], axis=1)
+        every = [deciding_directions(evaluation, n)[:, n * (i > 0) :] for i, evaluation in enumerate(evaluations)]
+        directions, points = np.concatenate(every, axis=1), []
         for s, q in enumerate(coefficients):
             own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
-            metric = chain @ evaluation.matrix[np.ix_(own, own)] @ chain.T
+            metric = chain @ evaluations[0].matrix[np.ix_(own, own)] @ chain.T
             points.append(LinearisationPoint(moduli, q, chain @ directions[own], metric, all_material))
         return points
 
@@ -237,30 +191,15 @@ class Objective:
         states = [replace(s, bending=model) if s.bending else s.with_approximation(model) for s, model in pairs]
         return replace(self, states=tuple(states))
 
-    def released(self, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> tuple[Objective, Evaluation]:
-        """The objective with those blocks free that were fixed, and its evaluation at unknowns (n_unknowns,)."""
-        objective = replace(self, parameters=self.parameters.released())
-        before, (value, pull) = _prior(self.parameters, unknowns)[0], _prior(objective.parameters, unknowns)
-        prior, moved = objective.parameters.prior_matrix, pull - evaluation.prior_score
-        return objective, replace(
-            evaluation,
-            value=evaluation.value - before + value,
-            score=evaluation.score + moved,
-            matrix=evaluation.matrix - evaluation.prior + prior,
-            prior=prior,
-            prior_score=pull,
-        )
+    def believing(self, parameters: ParameterMap) -> Objective:
+        """The same under another prior of its unknowns."""
+        return replace(self, parameters=parameters)
 
     def with_observations(self, observations: Sequence[Observation]) -> Objective:
         """The same with each observation otherwise weighted or matched, in the order of `observations`."""
         left = iter(observations)
         states = [state.with_observations([next(left) for _ in state.observations]) for state in self.states]
         return replace(self, states=tuple(states))
-
-    def counted_as(self, other: Objective) -> Objective:
-        """The same with the numbers of independent residuals of another one, under which both may be compared."""
-        pairs = zip(self.observations, other.observations, strict=True)
-        return self.with_observations([mine.with_correlation(theirs.noise_model) for mine, theirs in pairs])
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J with score, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
@@ -279,6 +218,17 @@ class Objective:
             misfit += loss / len(linearisations)
             value += 0.5 * term.precision * loss
         return Evaluation(value, misfit, score, matrix, tuple(linearisations), prior, pull, self.parameters.images)
+
+    def weighed(
+        self, unknowns: NDArray[np.float64], linearisations: Sequence[Linearisation], like: Sequence[Linearisation]
+    ) -> Evaluation:
+        """The evaluation at `unknowns` (n_unknowns,) from residuals there, with the robust weights of others."""
+        every = zip(self.observations, linearisations, like, strict=True)
+        found = [
+            Linearisation.of(observation, of.state, of.residuals, of.columns, of.jacobian, other.weights)
+            for observation, of, other in every
+        ]
+        return self.assembled(unknowns, found)
 
     def rematched(self, unknowns: NDArray[np.float64]) -> Objective:
         """The same with what belongs together in model and image chosen anew at unknowns (n_unknowns,).
@@ -358,14 +308,12 @@ class LinearisedObjective:
     """An objective with the residuals linear around unknowns (n_unknowns,) where it was evaluated.
 
     No displacement and no closest point is sought: a value costs a hundredth. `objective` says how much each residual
-    counts; its hyper-parameters may be others than those of the evaluation. damping: mu, 1/2 mu d^T diag(H) d of the
-    step d is added (Levenberg and Marquardt).
+    counts, which may be other than in the evaluation.
     """
 
     objective: Objective
     unknowns: NDArray[np.float64]
     evaluation: Evaluation
-    damping: float = 0.0
 
     @property
     def n_parameters(self) -> int:
@@ -375,15 +323,8 @@ class LinearisedObjective:
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J at `unknowns` (n_unknowns,) with the residuals r + J (x - x_0) by the Jacobians."""
         step = unknowns - self.unknowns
-
         pairs = zip(self.objective.observations, self.evaluation.linearisations, strict=True)
-        moved = mapped(lambda pair: pair[1].moved(pair[0], step), pairs)
-        found = self.objective.assembled(unknowns, moved)
-        if not self.damping:
-            return found
-        ridge = self.damping * np.diag(self.evaluation.matrix)
-        value, pull = found.value + 0.5 * float(step @ (ridge * step)), ridge * step
-        return replace(found, value=value, score=found.score + pull, matrix=found.matrix + np.diag(ridge))
+        return self.objective.assembled(unknowns, mapped(lambda pair: pair[1].moved(pair[0], step), pairs))
 
 
 def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np.float64]:
@@ -401,17 +342,6 @@ def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np
 def _robust_weights(observation: Observation, residuals: Residuals) -> NDArray[np.float64]:
     """The weights (n,) of residuals, times the robust weights of the loss."""
     return np.asarray(residuals.weights * observation.weighting.loss.weight(residuals.values))
-
-
-def worse_driver(sd: float, kind_sd: float) -> float:
-    """Minus the log prior of a driver's scale: as that of its kind, or larger, by a factor of 2 seldom."""
-    return 0.5 * (max(float(np.log(sd / kind_sd)), 0.0) / DRIVER_LN_SD) ** 2
-
-
-def log_det(matrix: NDArray[np.float64], images: Images = ()) -> float:
-    """Ln det of a positive definite matrix (n, n), without the unknowns that nothing depends on."""
-    seen = np.diag(matrix) > 0.0
-    return log_determinant(matrix[np.ix_(seen, seen)], among(images, seen)) if seen.any() else 0.0
 
 
 def _prior(parameters: ParameterMap, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -1,4 +1,4 @@
-"""Where an estimate begins: in what the images tell of all unknowns, and near the minima to which all starts lead.
+"""Where an estimate begins: in what the images tell of all unknowns, and what all starts lead to.
 
 Of all unknowns beside the moduli those combinations stay that the images tell: a likelihood-informed subspace. Most
 modes of a frame, or of a tissue's ln E, move no observed surface by as much as its noise: the images leave them what
@@ -16,28 +16,30 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.approximation.reduced_basis import SNAPSHOT, ReducedBasis, basis_of
-from palpate.inversion.frozen_posterior import cheapest_minima
+from palpate.inversion.frozen_posterior import Posterior
 from palpate.inversion.hyper_parameters import with_first_noise
 from palpate.inversion.later_state import InverseProblem, LaterState
-from palpate.inversion.objective import Evaluation, Objective
-from palpate.inversion.optimise import Bounds, Minimum, grouped, same_minimum
-from palpate.inversion.trust_region import NEAR, OuterIterate, begun, fit_coefficients, minimised
+from palpate.inversion.objective import LinearisedObjective, Objective
+from palpate.inversion.optimise import Bounds, Minimum, Outcome, gauss_newton, grouped
+from palpate.inversion.search import Searched, begun
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem, of_same_body
 from palpate.mechanics.reduced import free_combinations
+from palpate.parallel import mapped
 from palpate.progress import Progress
-from palpate.unknowns.blocks import Acts, Block
+from palpate.unknowns.blocks import FIELD, Acts, Block, Choice
 
-COMPARED = replace(NEAR, correlate=False)  # numbers of independent residuals stay, so that objectives can be compared
-FOLLOWED = 2  # best minima of starts that are followed beside the first minimum
+SCREENED = 0.01  # decrement at which the minimum of a start ends
+LEFT_OUT, LEFT_OUT_OF_MAP = 1.0, 0.3  # variances of the first noise that what is left out may explain; of a map
+FITS, FIT = 4, 0.02  # of the coefficients; share of one posterior variance that a coefficient may still move
 
 
 @dataclass(frozen=True, slots=True)
 class StartRun:
     """What one start did on the cheapest model: log-moduli (n_parameters,) where it began, and the minimum it found.
 
-    candidate: number of the minimum that it leads to, None where that was not followed, others being lower.
+    candidate: number of the distinct minimum that it leads to, None where it did not converge.
     """
 
     theta: NDArray[np.float64]
@@ -45,51 +47,21 @@ class StartRun:
     candidate: int | None
 
 
-def from_starts(
-    problem: InverseProblem,
-    centre: NDArray[np.float64],
-    starts: Sequence[NDArray[np.float64]],
-    bounds: Bounds,
-    *,
-    progress: Progress,
-) -> tuple[tuple[OuterIterate, ...], tuple[StartRun, ...], Evaluation]:
-    """The distinct minima near which all starts lead, the best one foremost; what each did; J at no motion.
-
-    centre: theta (n_parameters,) where the first minimum is sought; starts: theta (n_parameters,) each, followed on the
-    cheapest model with the closest points of that one. The best are followed further. Raises as `invert` does.
-    """
-    start, n = informed_start(problem, centre, progress=progress), problem.parameters.n_parameters
-    nothing = np.zeros(len(start.minimum.unknowns))
-    rest = start.objective.rematched(nothing)(nothing)
-    first = minimised(start, bounds, NEAR, progress=progress, title="the first minimum")
-    progress(f"{len(starts)} starts, with the closest points of the first minimum")
-    at, made, ends = first.minimum, replace(first, checks=SolveCounts()).counts, [first]
-    begins = [np.concatenate([theta, at.unknowns[n:]]) for theta in starts]
-    screened = cheapest_minima(first.objective, at.unknowns, at.evaluation, begins, bounds)
-    groups = grouped(screened, n)
-    belongs, followed = {groups[i]: 0 for i, m in enumerate(screened) if same_minimum(m.unknowns, at, n)}, 0
-    for number in sorted(range(len(screened)), key=lambda i: screened[i].evaluation.value):
-        if followed == FOLLOWED or groups[number] in belongs or not screened[number].converged:
-            continue
-        begin = replace(begun(first.objective, screened[number].unknowns), checks=SolveCounts() - made)  # its own cost
-        end = minimised(begin, bounds, COMPARED, progress=progress, title=f"start {number + 1}")
-        followed += 1
-        met = [i for i, near in enumerate(ends) if same_minimum(end.minimum.unknowns, near.minimum, n)]
-        belongs[groups[number]] = met[0] if met else len(ends)
-        if not met:
-            ends.append(end)
-            continue
-        near, spent = ends[met[0]], ends[met[0]].minimum.evaluations + end.minimum.evaluations
-        minimum = replace(near.minimum, evaluations=spent)
-        ends[met[0]] = replace(near, minimum=minimum, checks=near.checks + end.counts)
-    values = [(not end.minimum.converged, end.objective.total(end.minimum.evaluation)) for end in ends]
-    order = sorted(range(len(ends)), key=lambda i: values[i])
-    candidates = [belongs.get(group) for group in groups]
-    runs = zip(starts, screened, (None if c is None else order.index(c) for c in candidates), strict=True)
-    return tuple(ends[i] for i in order), tuple(StartRun(*run) for run in runs), rest
+def started(
+    posterior: Posterior, near: NDArray[np.float64], starts: Sequence[NDArray[np.float64]], bounds: Bounds
+) -> tuple[StartRun, ...]:
+    """What each start does: theta (n_parameters,) each, all other unknowns as in `near` (n_unknowns,)."""
+    n = posterior.n_parameters
+    begins = [np.concatenate([theta, near[n:]]) for theta in starts]
+    minima = mapped(lambda begin: gauss_newton(posterior, begin, bounds=bounds, tolerance=SCREENED), begins)
+    groups = grouped(minima, n)
+    return tuple(
+        StartRun(theta, minimum, group if minimum.converged else None)
+        for theta, minimum, group in zip(starts, minima, groups, strict=True)
+    )
 
 
-def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progress: Progress) -> OuterIterate:
+def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progress: Progress) -> Searched:
     """Where the first minimum is sought, at theta (n_parameters,), in what the images tell of the problem's blocks.
 
     States that bring an approximation keep it and all unknowns, at which nothing moves. For the others the full models'
@@ -202,19 +174,39 @@ class _Responses:
         return basis.with_material(responses, self.system.moduli)
 
 
+def fit_coefficients(
+    objective: Objective, begin: NDArray[np.float64], *, fits: int = FITS, tolerance: float = FIT
+) -> Minimum:
+    """The best coefficients of the blocks at the log-moduli of `begin` (n_unknowns,), sought from there.
+
+    Closest points and coefficients in turn, `fits` times at most, until the decrement of a coefficient is below the
+    tolerance: the minimum has converged then.
+    """
+    theta, at = begin[: objective.n_parameters], objective(begin)
+    still, unknowns, evaluations = Bounds(theta, theta), begin, 1
+    for _ in range(fits):
+        found = gauss_newton(LinearisedObjective(objective, unknowns, at), unknowns, bounds=still)
+        step, unknowns = found.unknowns - unknowns, found.unknowns
+        objective = objective.rematched(unknowns)
+        moved, at, evaluations = 0.5 * float(step @ at.matrix @ step), objective(unknowns), evaluations + 1
+        if moved < tolerance * len(unknowns):
+            return Minimum(unknowns, at, Outcome.CONVERGED, (), evaluations)
+    return Minimum(unknowns, at, Outcome.STEPS, (), evaluations)
+
+
 def informed_combinations(
     block: Block, information: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Combinations (n, k) of a block's unknowns that data of an information (n, n) see, and their inverse (k, n).
 
     Of a motion or a field whose prior is learned, at least the one that is seen most. Other unknowns stay as they are:
-    Poisson's ratios have a tissue each, edges are made of what data see and what they do not see alone.
+    Poisson's ratios have a tissue each.
     """
-    if not block.alternatives or block.acts is Acts.RESIDUALS:
+    if not block.terms and block.choice not in (Choice.FRAME, Choice.PATCHINESS):
         return np.eye(block.size), np.eye(block.size)
     root = linalg.cholesky(block.widest, lower=True)
     sizes, vectors = linalg.eigh(root.T @ information @ root)
-    left = np.cumsum(np.maximum(sizes, 0.0)) < block.left_out
+    left = np.cumsum(np.maximum(sizes, 0.0)) < (LEFT_OUT_OF_MAP if block.cause == FIELD else LEFT_OUT)
     left[-1:] = False
     kept = vectors[:, ~left][:, ::-1]
     unit = float(np.sqrt(np.mean(np.diag(block.widest))))  # coefficients keep their size

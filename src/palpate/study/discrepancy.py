@@ -14,7 +14,7 @@ from palpate.inversion import Inversion
 from palpate.mechanics.finite_strain import NEARLY_INCOMPRESSIBLE
 from palpate.mesh.surface import cut_faces
 from palpate.uncertainty import NORMAL_95, FittedState
-from palpate.unknowns import LAYER, in_series
+from palpate.unknowns import LAYER, Choice, in_series
 
 TOLD = 2.0  # standard deviations, above which an offset is reported in words
 LEAST_TOLD_MM = 0.1
@@ -117,7 +117,7 @@ def fitted_materials(inversion: Inversion) -> tuple[FittedMaterial, ...]:
     parameters, found = inversion.objective.parameters, list[FittedMaterial]()
     unknowns = inversion.minimum.unknowns
     coefficients, blocks = parameters.coefficients(unknowns), enumerate(parameters.blocks)
-    layers = [(b, unknowns[parameters.columns(i)]) for i, b in blocks if b.cause == LAYER and not b.released]
+    layers = [(b, unknowns[parameters.columns(i)]) for i, b in blocks if b.cause == LAYER]
     for state, of_state in zip(inversion.objective.states, coefficients, strict=True):
         mesh, material = state.model.space.mesh, state.model.material
         own = of_state[state.model.constraint.n_modes :]
@@ -142,13 +142,13 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
         precision = parameters.nuisance_precision[np.ix_(own - n, own - n)]
         learned = float(np.sqrt(np.mean(np.diag(np.linalg.inv(precision))))) if block.size else 0.0
         if block.cause == "offset":
-            variance = 1.0 / block.precision[0, 0] if block.considered else rows[own[0], own[0]]
+            variance = block.widest[0, 0] if block.choice is Choice.HELD else rows[own[0], own[0]]
             value, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(variance))
             offsets.append(OffsetFound(block.of, block.states[0], value, (value - half, value + half)))
         elif block.cause == "heterogeneity":
-            patchy = block.alternatives[1][0]  # the first is nearly homogeneous, the last very patchy
+            patchy = block.alternatives[1].covariance  # the first is nearly homogeneous, the last very patchy
             heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(np.mean(np.diag(patchy))))))
-        elif block.cause == LAYER and not block.released:
+        elif block.cause == LAYER and inversion.mixture.explanations[0].chosen.get(number):
             x, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(rows[own[0], own[0]]))
             low, ratio, high = np.exp([x - half, x, x + half]).tolist()
             layers.append(LayerFound(block.of, ratio, (low, high)))

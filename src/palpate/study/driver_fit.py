@@ -15,13 +15,11 @@ from palpate.errors import NotConverged
 from palpate.inversion.hyper_parameters import with_amplitudes
 from palpate.inversion.later_state import InverseProblem
 from palpate.inversion.objective import Objective
-from palpate.inversion.optimise import Bounds
-from palpate.inversion.trust_region import StopRule, begun, fit_coefficients, minimised
+from palpate.inversion.starts import fit_coefficients
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.observation.noise_model import SEGMENTATION_NOISE
-from palpate.progress import silent
 
-ON_WALL = StopRule(step_sd=np.inf, coefficients=1e-3, model_error=np.inf, derivatives=False, learn=False)
+FITS, TOLERANCE = 25, 1e-3  # of the wall
 
 Motions = tuple[NDArray[np.float64], ...]
 
@@ -68,8 +66,7 @@ def _fitted(
     )
     first = fit_coefficients(objective, np.concatenate([still, coefficients]))
     objective = with_amplitudes(objective, first.evaluation, first.unknowns)
-    begin, fixed = begun(objective, first.unknowns), Bounds(still, still)
-    found = minimised(begin, fixed, ON_WALL, progress=silent, title="").minimum
+    found = fit_coefficients(objective, first.unknowns, fits=FITS, tolerance=TOLERANCE)
     if not found.converged:
         raise NotConverged(f"the driver's wall could not be fitted to the later image: {found.outcome.value}")
     return objective.parameters.coefficients(found.unknowns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.findings import Finding, listing
 from palpate.images.checks import later_names
-from palpate.inversion import Inversion, Outcome
+from palpate.inversion import Inversion
 from palpate.mechanics.element import deformation_determinants
 from palpate.observation.contract import OfInstrument
 from palpate.study.estimated import ModulusEstimate
@@ -19,6 +20,7 @@ from palpate.uncertainty import FittedState
 
 STRONG_CORRELATION = 0.99
 HETEROGENEOUS = 0.01  # probability of such differences between image pairs that have the same moduli
+SEVERAL = 0.05  # probability of a further minimum that is told
 NOISIER, LEAST_IMAGES = 1.6, 3  # times the usual noise of so many later images: one is drawn badly
 
 
@@ -34,45 +36,21 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
                 " kPa, give one tissue the role known with its youngs_modulus_kpa, or state a load.",
             )
         )
-    if inversion.convergence.unmet:
+    if not inversion.minimum.converged:
         findings.append(
             Finding(
                 "unsettled",
-                listing(
-                    "The search ended before it converged: ",
-                    inversion.convergence.unmet,
-                    ". The model may not fit the data: try a smaller mesh.edge_length_mm, another law, or [noise].",
-                ),
+                f"The search ended before it converged: {inversion.minimum.outcome.value}. The model may not fit the"
+                " data: try a smaller mesh.edge_length_mm, another law, or [noise].",
             )
         )
-    if inversion.unsettled:
-        findings.append(
-            Finding(
-                "unsettled",
-                "The search with soft or stiff layers around organs did not converge (log.txt says why), so intervals"
-                " may miss the effect of such a layer. Try another mesh.edge_length_mm, or set discrepancy.layer_sd = 0"
-                " if there is none.",
-            )
-        )
-    lost = [c for c in inversion.candidates if c.minimum.outcome is Outcome.NO_EQUILIBRIUM]
-    if lost:
-        findings.append(
-            Finding(
-                "no-equilibrium",
-                f"{len(lost)} of {len(inversion.candidates)} minima of the linear law have no equilibrium under the"
-                " case's law, so they were not compared with the others. Try other estimate.start_ratios to see whether"
-                " they are minima at all.",
-            )
-        )
-    left = sum(c.minimum.outcome is Outcome.NOT_FOLLOWED for c in inversion.candidates)
-    unknown = f", except {left} that could not be followed (log.txt says why)" if left else ""
-    if len(inversion.candidates) - len(lost) > 1:
+    alike = Counter(tuple(sorted(of.chosen.items())) for of in inversion.mixture.explanations if of.weight > SEVERAL)
+    if max(alike.values(), default=0) > 1:
         findings.append(
             Finding(
                 "several-minima",
-                "The starts of the search ended in different minima; the best fit is reported, and its intervals cover"
-                f" all that fit nearly as well{unknown}. Look at starts in result.json; use a pair with a larger"
-                " motion.",
+                "The starts of the search ended in different minima that explain the images about as well; the interval"
+                " covers them. Look at starts in result.json; use a pair with a larger motion.",
             )
         )
     sd = np.sqrt(np.diag(covariance))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.findings import Finding
+from palpate.inversion import Explanation
 from palpate.observation.contract import Fit, PointMotions
 from palpate.study.discrepancy import FittedMaterial, FoundDiscrepancy
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate
@@ -124,7 +125,8 @@ class Estimation:
     known where single moduli are not; regions: joint ones of two moduli; forces, points: measured and fitted;
     image_pairs: what each of several later images says alone; samples: of the moduli's posterior,
     where the case asks for them and the estimate converged; variations: what would change the answer; maps: of tissues
-    whose modulus is a field; materials: of the elements, one for each later state.
+    whose modulus is a field; materials: of the elements, one for each later state;
+    explanations: of which the posterior is a mixture.
     """
 
     status: str
@@ -151,6 +153,7 @@ class Estimation:
     variations: tuple[Variation, ...] = ()
     maps: tuple[StiffnessMap, ...] = ()
     materials: tuple[FittedMaterial, ...] = ()
+    explanations: tuple[Explanation, ...] = ()
 
     @property
     def correlation(self) -> NDArray[np.float64]:

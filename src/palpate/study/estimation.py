@@ -26,8 +26,8 @@ from palpate.study.estimated import Estimation, ForceFit, Iteration, PointFit, S
 from palpate.study.map_words import map_findings
 from palpate.study.misfit import beside_misfits, misfits_of
 from palpate.study.poisson_ratios import NOT_IDENTIFIED
-from palpate.study.samples import CHAINS, draw_moduli, sample_findings
-from palpate.study.stated_posterior import stated_posteriors
+from palpate.study.samples import draw_moduli
+from palpate.study.stated_posterior import stated_posterior
 from palpate.study.together import combinations_of, image_pairs_of, regions_of
 from palpate.study.verdicts import IDENTIFIED, estimates_of, intervals_of, ratios_of
 from palpate.uncertainty import (
@@ -68,12 +68,13 @@ def conclude(
     rng = np.random.default_rng(seed)
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
     errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
-    bonded = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
+    own = covariance_of(objective, minimum.evaluation, errors)
     progress("intervals: the models made exact where profiles end")
-    covariance, posteriors = stated_posteriors(inversion, bonded, settings.bounds)
+    posterior = stated_posterior(inversion, own, settings.bounds)
+    covariance = posterior.mixture.covariance
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors)
-    known = intervals_of(inversion, settings, posteriors)
+    known = intervals_of(inversion, settings, posterior)
     fits, forces, points = _seen(inversion, observed)
     misfits = misfits_of(minimum.evaluation.linearisations, points, observed.states[0].space.mesh.tissues)
     told = misfits if minimum.converged else ()
@@ -81,12 +82,12 @@ def conclude(
     of_moduli = covariance.total[: len(estimates), : len(estimates)]
     stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
     pairs = pairs and pairs.with_intervals_of(stating)
-    regions = regions_of(inversion, posteriors, settings.bounds, tissues=stating)
+    regions = regions_of(inversion, posterior, settings.bounds, tissues=stating)
     drawn = None
     if samples and minimum.converged:
-        progress(f"intervals: {samples} samples of the posterior in each of {CHAINS} chains")
-        stated = [e.interval95 if objective.parameters.absolute else e.ratio_interval95 for e in estimates]
-        drawn = draw_moduli(posteriors[-1], stated, bounds=settings.bounds, draws=samples, rng=rng)
+        progress(f"intervals: {samples} samples of the posterior")
+        marginals, ends = [of.marginal for of in known], [of.interval for of in known]
+        drawn = draw_moduli(objective.parameters, posterior.mixture, marginals, ends, draws=samples, rng=rng)
     found_discrepancy = discrepancy_of(inversion, observed.states) if minimum.converged else FoundDiscrepancy()
     maps = stiffness_maps(inversion, np.diag(covariance.total)) if minimum.converged else ()
     shares = dict[str, Mapping[str, float]]()
@@ -102,7 +103,6 @@ def conclude(
         *fold_findings(observed.states, names),
         *data_findings(inversion),
         *(misfit.finding for misfit in misfits),
-        *sample_findings(drawn),
         *discrepancy_findings(found_discrepancy),
         *map_findings(maps),
     )
@@ -124,11 +124,12 @@ def conclude(
         information=information(of_moduli),
         information_shares=shares,
         discrepancy=found_discrepancy,
-        combinations=combinations_of(inversion, posteriors[0].frozen, of_moduli, settings.bounds, within=IDENTIFIED),
+        combinations=combinations_of(inversion, posterior, settings.bounds, within=IDENTIFIED),
         regions=regions,
         image_pairs=pairs,
         samples=drawn,
         maps=maps,
+        explanations=inversion.mixture.explanations,
         materials=fitted_materials(inversion),
     )
 
@@ -144,13 +145,7 @@ def _reason(inversion: Inversion) -> str:
     starts = f"{inversion.minimum.outcome.value}; {len(ended)} of {len(inversion.starts)} starts"
     if not inversion.minimum.converged:
         return f"{starts} led to {minima} of the starting model, but the estimate from there did not converge"
-    outcomes = [candidate.minimum.outcome for candidate in inversion.candidates]
-    lost, left = outcomes.count(Outcome.NO_EQUILIBRIUM), outcomes.count(Outcome.NOT_FOLLOWED)
-    return (
-        f"{starts} converged, to {minima}"
-        + (f", {lost} of which {'has' if lost == 1 else 'have'} no equilibrium under the law" if lost else "")
-        + (f", {left} of which could not be followed under the law" if left else "")
-    )
+    return f"{starts} converged, to {minima}"
 
 
 def _start(inversion: Inversion, start: StartRun) -> Start:

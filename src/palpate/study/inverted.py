@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import NotConverged
-from palpate.inversion import InverseProblem, Inversion, InversionSettings, StopRule, invert
-from palpate.inversion.trust_region import REPORTED
+from palpate.inversion import REPORTED, InverseProblem, Inversion, InversionSettings, StopRule, invert
 from palpate.mechanics.rest_state import unloaded_displacement
 from palpate.progress import Line, Progress, details, during
 from palpate.study.body import Body, joint_problem, strained_body

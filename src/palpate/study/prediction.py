@@ -15,8 +15,8 @@ from palpate.study.body import Body, joint_problem, on_linear_elements
 from palpate.study.case import Case, Mechanics
 from palpate.study.run import inversion_settings
 from palpate.study.verdicts import or_as_ratio, verdict, without_scale
-from palpate.uncertainty import Interval, covariance_of, error_noise, log_interval, sandwich_covariance
-from palpate.unknowns import KNOWN_MODULUS
+from palpate.uncertainty import Interval, covariance_of, error_noise, log_interval
+from palpate.unknowns import KNOWN_MODULUS, Choice
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,9 +122,9 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
         if (kpa := stated.get(name)) is not None:
             guess[i] = float(np.log(kpa / objective.parameters.scale_kpa))
     fitted = fit_coefficients(objective, guess)
-    found = covariance_of(objective, fitted.evaluation, (), unknowns=fitted.unknowns, noise_of=noise_of)
-    free = sandwich_covariance(*objective.released(fitted.evaluation, fitted.unknowns), noise_of)
-    found = found.with_released(objective, fitted.evaluation, free)
+    layers = {i: 1 for i, block in enumerate(objective.parameters.blocks) if block.choice is Choice.LAYERS}
+    free = objective.believing(objective.parameters.choosing(layers))
+    found = covariance_of(free, fitted.evaluation.under(free.parameters, fitted.unknowns), (), noise_of=noise_of)
     surfaces = [noise for (_, kind), noise in noise_of.items() if kind == "surface distance"]
     noise = surfaces[0] if surfaces else next(iter(noise_of.values()))
     mapping, moduli = objective.parameters, list[PredictedModulus]()

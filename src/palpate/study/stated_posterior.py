@@ -1,4 +1,4 @@
-"""The posteriors on which all that is stated of an inversion rests, their models exact as far as intervals go."""
+"""The posterior on which all that is stated of an inversion rests, its models exact as far as intervals go."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from palpate.approximation.contract import updated
 from palpate.errors import SolverError
-from palpate.inversion import Bounds, FrozenPosterior, Inversion, Minimum, Objective, frozen_posterior
+from palpate.inversion import Bounds, Inversion, Minimum, Objective, Posterior, cheapest_posterior
 from palpate.parallel import mapped
-from palpate.uncertainty import NORMAL_95, Covariance, modulus_interval, sandwich_covariance
+from palpate.uncertainty import NORMAL_95, Covariance, StatedMixture, modulus_interval, stated_mixture
 
 ROUNDS = 3  # largest number of times that models are made exact where profiles end
 STAYS = 0.1  # of the half-width: largest change of an end with which the rounds stop
@@ -20,31 +20,24 @@ STAYS = 0.1  # of the half-width: largest change of an end with which the rounds
 
 @dataclass(frozen=True, slots=True)
 class StatedPosterior:
-    """One that is stated: frozen, its minimum, and the covariance (n, n) of its parameters by all that is known."""
+    """The posterior of the likeliest explanation, frozen, its minimum, and the mixture over all of them."""
 
-    frozen: FrozenPosterior
+    frozen: Posterior
     minimum: Minimum
-    covariance: NDArray[np.float64]
+    mixture: StatedMixture
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance (n, n) of the parameters under the likeliest explanation, by all that is known."""
+        return self.mixture.covariances[0]
 
 
-def stated_posteriors(
-    inversion: Inversion, bonded: Covariance, bounds: Bounds
-) -> tuple[Covariance, tuple[StatedPosterior, ...]]:
-    """The covariance by all causes, and the posteriors, the widest last.
-
-    The first is that of the estimate, with its own covariance (`bonded`, where blocks are held that may be free); the
-    other, where such blocks were released, is about the minimum with them free, and has what they add.
-    """
+def stated_posterior(inversion: Inversion, own: Covariance, bounds: Bounds) -> StatedPosterior:
+    """What is stated; own: the covariance of the likeliest explanation by all causes (see `covariance_of`)."""
     objective, minimum = inversion.objective, inversion.minimum
-    fixed = frozen_posterior(objective, minimum.unknowns, minimum.evaluation)
-    first = StatedPosterior(fixed, minimum, bonded.total)
-    if (released := inversion.released) is None:
-        return bonded, (exact_at_ends(first, objective, bounds),)
-    sandwich = sandwich_covariance(released.objective, released.minimum.evaluation)
-    covariance = bonded.with_released(objective, minimum.evaluation, sandwich)
-    free = frozen_posterior(released.objective, released.minimum.unknowns, released.minimum.evaluation)
-    second = StatedPosterior(free, released.minimum, covariance.total)
-    return covariance, (first, exact_at_ends(second, released.objective, bounds))
+    mixture = stated_mixture(inversion.mixture, own, objective.parameters.blocks)
+    frozen = cheapest_posterior(objective, minimum.unknowns, minimum.evaluation)
+    return exact_at_ends(StatedPosterior(frozen, inversion.mixture.minimum, mixture), objective, bounds)
 
 
 def exact_at_ends(posterior: StatedPosterior, objective: Objective, bounds: Bounds) -> StatedPosterior:
@@ -71,13 +64,15 @@ def exact_at_ends(posterior: StatedPosterior, objective: Objective, bounds: Boun
             break
         asked = [objective.linearisation_points(x) for x in moved.values()]
         if not known and any(state.bending for state in objective.states):
-            asked.append(objective.linearisation_points(least.unknowns, least.evaluation, all_material=False))
+            there = [least.evaluation]
+            asked.append(objective.linearisation_points(least.unknowns, there, all_material=False))
         try:
             for points in asked:
                 models = updated(models, points)
         except SolverError:
             break
-        exact = frozen_posterior(objective.bent_as(models), least.unknowns)
+        bent = objective.bent_as(models)
+        exact = cheapest_posterior(bent, least.unknowns, bent(least.unknowns))
         posterior, known = replace(posterior, frozen=exact), {**known, **moved}
     return posterior
 

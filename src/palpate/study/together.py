@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
-from palpate.inversion import Bounds, Inversion, LeastSquares
+from palpate.inversion import Bounds, Inversion
 from palpate.parallel import mapped
 from palpate.study.stated_posterior import StatedPosterior
 from palpate.uncertainty import (
     NORMAL_95,
     Combination,
     GridErrors,
-    JointRegion,
     agreement,
     joint_region,
     known_pairs,
@@ -72,8 +69,7 @@ class ImagePairs:
 class ModulusRegion:
     """The joint 95 % region of two tissues' moduli (kPa, or ratios): places once around the estimate.
 
-    boundary: by the profile likelihood of both; ellipse: of ln E by their covariance; both of what holds them all where
-    several posteriors are stated; open: whether the bounds of the search cut the boundary.
+    boundary: by the profile likelihood of both; ellipse: of ln E by their covariance; open: whether the bounds of the search cut the boundary.
     """
 
     tissues: tuple[str, str]
@@ -91,22 +87,19 @@ def image_pairs_of(inversion: Inversion, bounds: Bounds, errors: GridErrors) -> 
     if len(inversion.objective.states) < 2 or not inversion.minimum.converged:
         return None
     scale, names = mapping.scale_kpa, mapping.tissues
-    both = pair_estimates(inversion.objective, inversion.minimum, bounds, errors, inversion.released)
-    usable = np.logical_and.reduce([every.converged for every in both])
+    every = pair_estimates(inversion.objective, inversion.minimum, bounds, errors)
+    usable = every.converged
     if np.count_nonzero(usable) < 2:
         return None
-    pairs = [every.of(usable, len(names)) for every in both]
-    agreed = [agreement(of) for of in pairs]
-    found = agreed[-1]  # whether images differ is asked of what is least sure
+    pairs = every.of(usable, len(names))
+    found = agreement(pairs)
 
     def stated(
-        each: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
+        theta: NDArray[np.float64], covariance: NDArray[np.float64]
     ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-        """Values, and 95 % intervals that hold all, by tissue, of log-moduli (n,) with their covariances (n, n)."""
-        halves = [(theta, NORMAL_95 * np.sqrt(np.diag(covariance))) for theta, covariance in each]
-        low = np.min([theta - half for theta, half in halves], axis=0)
-        high = np.max([theta + half for theta, half in halves], axis=0)
-        ends = scale * np.exp(np.stack([low, each[0][0], high]))
+        """Values and 95 % intervals, by tissue, of log-moduli (n,) with their covariance (n, n)."""
+        half = NORMAL_95 * np.sqrt(np.diag(covariance))
+        ends = scale * np.exp(np.stack([theta - half, theta, theta + half]))
         lows, middle, highs = (dict(zip(names, row.tolist(), strict=True)) for row in ends)
         return middle, {name: (lows[name], highs[name]) for name in names}
 
@@ -115,58 +108,49 @@ def image_pairs_of(inversion: Inversion, bounds: Bounds, errors: GridErrors) -> 
         own = PairAlone({}, {}, False, {}, {kind: noise.sd for kind, noise in state.noise.items()})
         if converged:
             s = next(left)
-            values, intervals = stated([(of.theta[s], of.covariance[s, :, s]) for of in pairs])
+            values, intervals = stated(pairs.theta[s], pairs.covariance[s, :, s])
             influence = dict(zip(names, found.influence[s].tolist(), strict=True))
             own = PairAlone(values, intervals, bool(found.outlier[s]), influence, own.noise_mm)
         alone.append(own)
-    mean, mean_interval = stated([(of.theta, of.covariance) for of in agreed])
+    mean, mean_interval = stated(found.theta, found.covariance)
     within = dict(zip(names, found.within_cv.tolist(), strict=True))
     return ImagePairs(tuple(alone), found.heterogeneity, within, mean, mean_interval)
 
 
 def combinations_of(
-    inversion: Inversion, fixed: LeastSquares, covariance: NDArray[np.float64], bounds: Bounds, *, within: float
+    inversion: Inversion, posterior: StatedPosterior, bounds: Bounds, *, within: float
 ) -> tuple[Combination, ...]:
-    """Ratios (dimensionless) and geometric means (kPa, or ratios) known within a factor; covariance (n, n) of ln E."""
+    """Ratios (dimensionless) and geometric means (kPa, or ratios) known within a factor."""
     mapping = inversion.objective.parameters
     if not inversion.minimum.converged:
         return ()
     scale = mapping.scale_kpa
-    found = known_pairs(fixed, inversion.minimum, mapping.tissues, covariance, bounds=bounds, within=within)
+    n = len(mapping.tissues)
+    covariance = posterior.mixture.covariance.total[:n, :n]
+    own = posterior.frozen, posterior.minimum
+    found = known_pairs(*own, mapping.tissues, covariance, bounds=bounds, within=within)
     return tuple(pair.times(scale) if pair.kind == "geometric mean" else pair for pair in found)
 
 
 def regions_of(
-    inversion: Inversion, posteriors: Sequence[StatedPosterior], bounds: Bounds, *, tissues: Collection[str]
+    inversion: Inversion, posterior: StatedPosterior, bounds: Bounds, *, tissues: Collection[str]
 ) -> tuple[ModulusRegion, ...]:
     """Of the pairs of `tissues` whose moduli are correlated most, `MOST_REGIONS` at the most.
 
-    posteriors: those that an interval holds, the widest last; a region holds those of all, as the smallest that is
-    convex. None is stated of a modulus that is not identified.
+    None is stated of a modulus that is not identified.
     """
-    mapping, covariance = inversion.objective.parameters, posteriors[-1].covariance
+    mapping, covariance = inversion.objective.parameters, posterior.mixture.covariance.total
     sd = np.sqrt(np.diag(covariance))
     correlated = -np.abs(covariance / np.outer(sd, sd))
     stated = [i for i, tissue in enumerate(mapping.tissues) if tissue in tissues]
-    pairs = sorted(combinations(stated, 2), key=lambda pair: float(correlated[pair]))
-    found = []
-    for pair in pairs[:MOST_REGIONS]:
-        regions = mapped(partial(_region, pair=pair, bounds=bounds), posteriors)
-        edges = [_around([r.boundary for r in regions]), _around([r.ellipse for r in regions])]
-        boundary, ellipse = (tuple((float(a), float(b)) for a, b in mapping.scale_kpa * np.exp(edge)) for edge in edges)
-        names = mapping.tissues[pair[0]], mapping.tissues[pair[1]]
-        found.append(ModulusRegion(names, boundary, ellipse, any(region.open for region in regions)))
-    return tuple(found)
+    pairs = sorted(combinations(stated, 2), key=lambda pair: float(correlated[pair]))[:MOST_REGIONS]
 
+    def region(pair: tuple[int, int]) -> ModulusRegion:
+        """That of two moduli."""
+        own = covariance[np.ix_(pair, pair)]
+        found = joint_region(posterior.frozen, posterior.minimum, pair, covariance=own, bounds=bounds)
+        edges = mapping.scale_kpa * np.exp(found.boundary), mapping.scale_kpa * np.exp(found.ellipse)
+        boundary, ellipse = (tuple((float(a), float(b)) for a, b in edge) for edge in edges)
+        return ModulusRegion((mapping.tissues[pair[0]], mapping.tissues[pair[1]]), boundary, ellipse, found.open)
 
-def _region(of: StatedPosterior, *, pair: tuple[int, int], bounds: Bounds) -> JointRegion:
-    """That of two moduli by one posterior."""
-    return joint_region(of.frozen, of.minimum, pair, covariance=of.covariance[np.ix_(pair, pair)], bounds=bounds)
-
-
-def _around(edges: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """The edge (n, 2) of the smallest convex region that holds all of several, (m, 2) each, or of a single one."""
-    if len(edges) == 1:
-        return edges[0]
-    points = np.concatenate(edges)
-    return np.asarray(points[ConvexHull(points).vertices])
+    return tuple(mapped(region, pairs))

@@ -29,6 +29,7 @@ from palpate.uncertainty import (
     sobol_indices,
     surface_errors,
 )
+from palpate.unknowns import Choice
 
 POISSON_STEP = 0.02
 KNOWN_FACTOR = 1.2
@@ -311,7 +312,7 @@ def _inputs(
 def _offset(inversion: Inversion) -> list[str]:
     """The surfaces whose offset is an unknown of the estimate."""
     blocks = inversion.objective.parameters.blocks
-    return list(dict.fromkeys(block.of for block in blocks if block.cause == "offset" and not block.considered))
+    return list(dict.fromkeys(block.of for block in blocks if block.choice is Choice.DRAWING))
 
 
 def _poisson_steps(ratio: float) -> tuple[float, float]:

@@ -4,28 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
-from palpate.inversion import Inversion, InversionSettings, as_good
+from palpate.inversion import Inversion, InversionSettings
 from palpate.parallel import mapped
 from palpate.study.estimated import ModulusEstimate, no_estimate
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.stated_posterior import StatedPosterior
-from palpate.uncertainty import NORMAL_95, Covariance, Interval, ModulusInterval, log_interval, modulus_interval
+from palpate.uncertainty import NORMAL_95, Covariance, Interval, Marginal, ModulusInterval, log_interval, marginals_of, modulus_interval
 from palpate.unknowns import KNOWN_MODULUS, ratio_of_eta
 
 IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
 NOT_FOLLOWED = "the 95 % interval is open: it could not be computed from a minimum"
-
-
-def hull(intervals: Sequence[Interval]) -> Interval:
-    """Smallest interval that holds all of one or more; an end that is open in one of them is open."""
-    lows, highs = [low for low, _ in intervals], [high for _, high in intervals]
-    low = None if None in lows else min(end for end in lows if end is not None)
-    high = None if None in highs else max(end for end in highs if end is not None)
-    return low, high
 
 
 def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str, str]:
@@ -51,45 +42,38 @@ def verdict(interval: Interval, *, at_bound: bool, absolute: bool) -> tuple[str,
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """Of one parameter: its own interval, one that holds all minima that fit as well, both of e^theta; at a bound.
+    """Of one parameter: its median, its interval as e^theta, whether the likeliest explanation lies at a bound.
 
-    followed: whether each posterior's profile could be followed from its minimum.
+    own: the interval of the likeliest explanation alone, with its profile; followed: whether that could be followed.
     """
 
+    theta: float
+    marginal: Marginal
     own: ModulusInterval
     interval: Interval
     at_bound: bool
     followed: bool
 
 
-def intervals_of(
-    inversion: Inversion, settings: InversionSettings, posteriors: Sequence[StatedPosterior]
-) -> tuple[Known, ...]:
-    """Of each parameter its interval, which holds that of each of the `posteriors`; none where nothing converged."""
+def intervals_of(inversion: Inversion, settings: InversionSettings, posterior: StatedPosterior) -> tuple[Known, ...]:
+    """Of each parameter its quantiles over all explanations; none where nothing converged."""
     if not inversion.minimum.converged:
         return ()
-    first, n, bounds = posteriors[0], inversion.objective.n_parameters, settings.bounds
-    found, variances, at_bound = [], np.diag(first.covariance), bounds.reached(inversion.minimum.unknowns[:n])
+    n, bounds, variances = inversion.objective.n_parameters, settings.bounds, np.diag(posterior.covariance)
+    at_bound = bounds.reached(posterior.minimum.unknowns[:n])
 
-    def interval(of: tuple[int, StatedPosterior]) -> ModulusInterval:
-        """That of one parameter by one posterior."""
-        number, by = of
-        variance = float(by.covariance[number, number])
-        return modulus_interval(by.frozen, by.minimum, number, variance=variance, bounds=bounds)
+    def interval(number: int) -> ModulusInterval:
+        """That of one parameter by the likeliest explanation."""
+        variance = float(variances[number])
+        return modulus_interval(posterior.frozen, posterior.minimum, number, variance=variance, bounds=bounds)
 
-    every = mapped(interval, product(range(n), posteriors))
-    best = inversion.candidates[inversion.best]
-    minima = [c for c in inversion.candidates if c is not best and c.minimum.converged]
-    scales = np.diag(inversion.minimum.evaluation.covariance_columns(n)[:n]) / variances  # of a profile's deviance
-    for i in range(n):
-        limits = {"lower": float(np.exp(bounds.lower[i])), "upper": float(np.exp(bounds.upper[i]))}
-        own, *wider = every[i * len(posteriors) : (i + 1) * len(posteriors)]
-        sd = float(np.sqrt(variances[i]))
-        good = [c.minimum.unknowns for c in minima if as_good(c.value, best.value, scale=float(scales[i]))]
-        ellipses = (log_interval(float(np.exp(x[i])), sd, **limits) for x in good)
-        whole = hull([own.ends, *ellipses, *(of.ends for of in wider)])
-        followed = all(len(of.profile.theta) > 1 for of in (own, *wider))
-        found.append(Known(own, whole, bool(at_bound[i]), followed))
+    every = mapped(interval, range(n))
+    marginals, found = marginals_of(posterior.mixture, tuple(of.profile for of in every)), list[Known]()
+    for i, (own, marginal) in enumerate(zip(every, marginals, strict=True)):
+        ends = float(bounds.lower[i]), float(bounds.upper[i])
+        middle = marginal.quantile(0.5, ends)
+        theta = float(inversion.mixture.mean[i]) if middle is None else middle
+        found.append(Known(theta, marginal, own, marginal.interval(ends), bool(at_bound[i]), len(own.profile.theta) > 1))
     return tuple(found)
 
 
@@ -100,11 +84,7 @@ def estimates_of(
     *,
     truth: Mapping[str, float],
 ) -> tuple[ModulusEstimate, ...]:
-    """The estimates of moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known.
-
-    Where the inversion is `unsettled`, the covariance lacks the effect of layers around organs, and nothing is
-    `identified`.
-    """
+    """The estimates of moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known. Values are medians."""
     mapping, scale = inversion.objective.parameters, inversion.objective.parameters.scale_kpa
     none = [
         no_estimate(
@@ -122,7 +102,7 @@ def estimates_of(
     given = np.diag(covariance.total if covariance.given_model is None else covariance.given_model)
     shift = mapping.reference_shift(inversion.minimum.unknowns)
     for i, (nothing, of) in enumerate(zip(none, known, strict=False)):
-        theta, (low, high) = float(inversion.minimum.unknowns[i]), of.interval
+        theta, (low, high) = of.theta, of.interval
         value, shares = float(np.exp(theta)), covariance.shares(i)
         of_scale = float(np.sqrt(shares.get(KNOWN_MODULUS, 0.0) * covariance.total[i, i]))
         by_ratio = without_scale(of_scale, of.interval, value, centre=float(np.exp(theta - shift)))
@@ -130,9 +110,6 @@ def estimates_of(
         why = why if of.followed or of.at_bound else NOT_FOLLOWED
         if of_scale > 0.0:
             word, why = or_as_ratio((word, why), by_ratio, at_bound=of.at_bound)
-        if inversion.unsettled and word != NOT_IDENTIFIED:
-            word = "weak" if word == "identified" else word
-            why = f"{why}, but leaves out the effect of layers around organs (warning `unsettled`)"
         points = zip(unit * np.exp(of.own.profile.theta), of.own.profile.root, strict=True)
         inside = log_interval(value, float(np.sqrt(given[i])), lower=low or 0.0, upper=high or np.inf)
         within = (inside[0] or low, inside[1] or high)
@@ -200,7 +177,7 @@ def ratios_of(inversion: Inversion, known: Sequence[Known], covariance: Covarian
         found.append(
             replace(
                 nothing,
-                value=open_.ratio(inversion.minimum.unknowns),
+                value=ratio_of_eta(of.theta),
                 interval95=_stated((low, high), word),
                 interval_kind=of.own.kind,
                 verdict=word,

@@ -22,8 +22,8 @@ from palpate.observation.contract import Imaged
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, mean_noise
 from palpate.parallel import mapped
-from palpate.uncertainty.alternatives import undecided_covariance
 from palpate.uncertainty.intervals import discretisation_sd
+from palpate.unknowns import Choice
 
 GridErrors = Sequence[Sequence[NDArray[np.float64]]]
 """Errors (n,) mm of the residuals of each observation, of each draw of a grid."""
@@ -65,7 +65,7 @@ class Covariance:
     Parameters are the log-moduli, then eta = ln(lambda / mu) of Poisson's ratios that are sought. noise: of the
     residuals; prior: that of all unknowns, of which `causes` are the parts by the cause of their block;
     grid: the place of the voxels, as far as it is not in noise that the residuals tell, which voxels round; mesh: what
-    another mesh would make of it (of Young's moduli). given_model: all that would be left if frame, drawing and
+    another mesh would make of it (of Young's moduli); held: the part of causes by blocks that are held. given_model: all that would be left if frame, drawing and
     material were as the model has them, and only the drivers' motion unknown.
     """
 
@@ -74,6 +74,7 @@ class Covariance:
     grid: NDArray[np.float64]
     mesh: NDArray[np.float64]
     causes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    held: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     given_model: NDArray[np.float64] | None = None
 
     @property
@@ -88,39 +89,18 @@ class Covariance:
         shares = {name: float(part[number, number] / self.total[number, number]) for name, part in parts.items()}
         return {name: share for name, share in shares.items() if name != "prior" or share > ROUNDING}
 
-    def with_released(self, objective: Objective, evaluation: Evaluation, free: NDArray[np.float64]) -> Covariance:
-        """The same with what blocks add that were held where it is `evaluation`'s (see `Block.released`).
-
-        free: the sandwich (n_parameters, n_parameters) with these blocks free.
-        """
-        causes = dict.fromkeys(block.cause for block in objective.parameters.blocks if block.released)
-        if not causes:
-            return self
-        rows = evaluation.covariance_columns(objective.n_parameters).T
-        part = added_by(free, held=self.noise + rows @ evaluation.prior @ rows.T)
-        return replace(self, prior=self.prior + part, causes={**self.causes, " and ".join(causes): part})
-
-
-def added_by(free: NDArray[np.float64], *, held: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What a covariance `held` (n, n), with some unknowns taken for known, lacks of that with these `free` (n, n).
-
-    The positive part of their difference: with it the whole is at least as large as each in every direction.
-    """
-    return _positive_part(free - held)
-
 
 def covariance_of(
     objective: Objective,
     evaluation: Evaluation,
     errors: GridErrors,
     *,
-    unknowns: NDArray[np.float64],
     noise_of: Mapping[tuple[int, str], NoiseModel] | None = None,
 ) -> Covariance:
-    """All that is known of the log-moduli's errors at unknowns (n_unknowns,).
+    """All that is known of the log-moduli's errors under one explanation of the images.
 
-    The sandwich, what is considered or undecided, the mesh, and what the scatter over grid positions, by the `errors`
-    there, adds (see `grid_covariance`); nothing of no errors. A block has the part H^-1 P_b H^-1 of the prior's.
+    The sandwich, blocks that are held, the mesh, and what the scatter over grid positions, by the `errors` there, adds
+    (see `grid_covariance`); nothing of no errors. A block has the part H^-1 P_b H^-1 of the prior's.
     noise_of: the residuals' noise where it is not that of the evaluation (see `error_noise`), whose residuals hold what
     wrong moduli leave.
     """
@@ -137,33 +117,30 @@ def covariance_of(
 
     noise, prior, grid = parts(evaluation)
     rows = evaluation.covariance_columns(objective.n_parameters).T
-    further = [_considered(objective, evaluation, rows), undecided_covariance(objective, evaluation, unknowns)]
-    prior = prior + sum((part for of in further for part in of.values()), np.zeros_like(prior))
+    held = _held(objective, evaluation, rows)
+    causes, prior = dict(held), prior + sum(held.values(), np.zeros_like(prior))
     left = noise + prior + grid if given is evaluation else sum(parts(given), np.zeros_like(noise))
-    inverse, causes = rows.T, dict[str, NDArray[np.float64]]()
-    for cause, part in (item for of in further for item in of.items()):
-        causes[cause] = causes.get(cause, np.zeros_like(part)) + part
+    inverse = rows.T
     for i, block in enumerate(objective.parameters.blocks):
-        if not block.released:  # `with_released` adds the share of these
-            own = objective.parameters.columns(i)
-            part = inverse[own].T @ evaluation.prior[np.ix_(own, own)] @ inverse[own]
-            causes[block.cause] = causes.get(block.cause, np.zeros_like(part)) + part
-    return Covariance(noise, prior, grid, mesh, causes, left + mesh)
+        own = objective.parameters.columns(i)
+        part = inverse[own].T @ evaluation.prior[np.ix_(own, own)] @ inverse[own]
+        causes[block.cause] = causes.get(block.cause, np.zeros_like(part)) + part
+    return Covariance(noise, prior, grid, mesh, causes, held, left + mesh)
 
 
-def _considered(
+def _held(
     objective: Objective, evaluation: Evaluation, rows: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
-    """By cause, S P_b^-1 S^T (k, k) of blocks that are considered, not estimated.
+    """By cause, S C_b S^T (k, k) of blocks that are held, not estimated (Schmidt 1966).
 
     S = -H^-1 J^T W J_b: how the unknowns with these rows (k, n_unknowns) of H^-1 answer to them.
     """
     found = dict[str, NDArray[np.float64]]()
     for i, block in enumerate(objective.parameters.blocks):
-        if block.considered:
+        if block.choice is Choice.HELD:
             own = objective.parameters.columns(i)
             answer = rows @ (evaluation.matrix - evaluation.prior)[:, own]
-            part = answer @ np.linalg.inv(block.precision) @ answer.T
+            part = answer @ block.widest @ answer.T
             found[block.cause] = found.get(block.cause, np.zeros_like(part)) + part
     return found
 
@@ -229,10 +206,10 @@ def sandwich_covariance(
 
 
 def covariance_among(objective: Objective, evaluation: Evaluation, numbers: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Covariance (k, k) of the unknowns with these `numbers` (k,): the sandwich, and what is considered."""
+    """Covariance (k, k) of the unknowns with these `numbers` (k,): the sandwich, and what is held."""
     rows = evaluation.covariance_columns(len(evaluation.matrix))[numbers]
     noise, prior = _sandwich(objective, evaluation, rows, error_noise(evaluation))
-    return sum(_considered(objective, evaluation, rows).values(), noise + prior)
+    return sum(_held(objective, evaluation, rows).values(), noise + prior)
 
 
 def _sandwich(

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from palpate.inversion import Bounds, Minimum, Objective, OuterIterate, fixed_correspondence, gauss_newton
+from palpate.inversion import Bounds, Minimum, Objective, fixed_correspondence, gauss_newton
 from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty.covariance import (
     GridErrors,
-    added_by,
     error_noise,
     gain,
     grid_covariance,
@@ -27,6 +26,7 @@ from palpate.uncertainty.covariance import (
     shifts_by,
 )
 from palpate.uncertainty.intervals import NORMAL_95, within_subject_cv
+from palpate.unknowns import Choice
 
 OUTLIER = 0.01  # probability of a false outlier among all pairs
 MOST_OUTLIERS = 4  # at most one pair of four is an outlier; where more differ, the pairs vary and none is wrong
@@ -69,27 +69,24 @@ class Agreement:
     covariance: NDArray[np.float64]
 
 
-def pair_estimates(
-    objective: Objective, minimum: Minimum, bounds: Bounds, errors: GridErrors, released: OuterIterate | None = None
-) -> tuple[PairEstimates, ...]:
+def pair_estimates(objective: Objective, minimum: Minimum, bounds: Bounds, errors: GridErrors) -> PairEstimates:
     """The estimate of each later state alone, near the joint `minimum`: with its closest points, weights and prior.
 
-    And a second one near where the joint estimate ends with blocks free that were held, if it is `released`, its
-    covariance larger by what these add (see `added_by`). The covariance has parts by noise and prior, by what is
-    considered, by the place of the grid (see `grid_covariance`), and by the mesh, which those of one reference share.
+    The covariance has parts by noise and prior, by blocks that are held, by the place of the grid (see
+    `grid_covariance`), and by the mesh, which those of one reference share.
     errors: of the residuals on random grids (see `grid_errors`). Nothing is solved; the approximations of the joint
     estimate stand. Raises `EstimationError` where a state alone leaves a driver's motion open.
     """
     alone = _each_alone(objective, minimum, bounds)
     noise, prior = _noise_and_prior(objective, alone)
     n, n_pairs, mapping = objective.n_parameters, len(alone), objective.parameters
-    considered = np.zeros((mapping.n_unknowns, n * n_pairs))  # J_b^T W J H_s^-1 e_i
+    held = np.zeros((mapping.n_unknowns, n * n_pairs))  # J_b^T W J H_s^-1 e_i
     shifts, mesh = list[NDArray[np.float64]](), np.zeros((n_pairs, n, n_pairs, n))
     references = [state.reference for state in objective.states]
     states = [s for s, state in enumerate(objective.states) for _ in state.observations]  # of each observation
     for s, evaluation in enumerate(of.evaluation for of in alone):
         of_data = evaluation.matrix - evaluation.prior
-        considered[mapping.alone(s)[1], s * n : (s + 1) * n] = of_data @ evaluation.covariance_columns(n)
+        held[mapping.alone(s)[1], s * n : (s + 1) * n] = of_data @ evaluation.covariance_columns(n)
         seen = [i for i, state in enumerate(states) if state == s]
         shifts.append(shifts_by(evaluation, [[draw[i] for i in seen] for draw in errors], n))
         of_mesh = mesh_covariance(replace(objective, states=(objective.states[s],)))
@@ -97,22 +94,13 @@ def pair_estimates(
             mesh[s, :, t] += of_mesh if references[s] == references[t] else 0.0
     total = noise + prior
     for i, block in enumerate(mapping.blocks):
-        if block.considered:
-            of_block = considered[mapping.columns(i)]
-            total += of_block.T @ np.linalg.solve(block.precision, of_block)
+        if block.choice is Choice.HELD:
+            of_block = held[mapping.columns(i)]
+            total += of_block.T @ block.widest @ of_block
     itself = np.kron(np.eye(n_pairs), np.ones((n, n)))
     grid = scatter(np.concatenate(shifts, axis=1)) * (BETWEEN_GRIDS + (1.0 - BETWEEN_GRIDS) * itself)
     covariance = (total + grid_covariance(alone[0].evaluation, grid, noise)).reshape(mesh.shape) + mesh
-    found = [_estimates(alone, covariance)]
-    if released is not None:
-        free = _each_alone(released.objective, released.minimum, bounds)
-        both = sum(_noise_and_prior(released.objective, free), np.zeros_like(noise))
-        found.append(_estimates(free, covariance + added_by(both, held=noise + prior).reshape(covariance.shape)))
-    return tuple(found)
-
-
-def _estimates(alone: Sequence[Minimum], covariance: NDArray[np.float64]) -> PairEstimates:
-    theta = np.stack([of.unknowns[: covariance.shape[1]] for of in alone])
+    theta = np.stack([of.unknowns[:n] for of in alone])
     return PairEstimates(theta, covariance, np.array([of.converged for of in alone]))
 
 

@@ -4,7 +4,9 @@ from palpate.unknowns.blocks import FIELD as FIELD
 from palpate.unknowns.blocks import KNOWN_MODULUS as KNOWN_MODULUS
 from palpate.unknowns.blocks import LAYER as LAYER
 from palpate.unknowns.blocks import Acts as Acts
+from palpate.unknowns.blocks import Alternative as Alternative
 from palpate.unknowns.blocks import Block as Block
+from palpate.unknowns.blocks import Choice as Choice
 from palpate.unknowns.blocks import frame_blocks as frame_blocks
 from palpate.unknowns.blocks import in_series as in_series
 from palpate.unknowns.blocks import instrument_block as instrument_block
@@ -18,4 +20,3 @@ from palpate.unknowns.parameters import ParameterMap as ParameterMap
 from palpate.unknowns.parameters import eta_of_ratio as eta_of_ratio
 from palpate.unknowns.parameters import parameter_map as parameter_map
 from palpate.unknowns.parameters import ratio_of_eta as ratio_of_eta
-from palpate.unknowns.total_variation import TotalVariation as TotalVariation

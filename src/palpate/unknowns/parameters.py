@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -313,15 +313,24 @@ class ParameterMap:
     def _model_columns(self, state: int) -> NDArray[np.int64]:
         return np.concatenate([self.acting(Acts.BOUNDARY, state), self.acting(Acts.MATERIAL, state)])
 
-    def released(self) -> ParameterMap:
-        """The same with those blocks free that are held while an estimate is sought (see `Block.released`)."""
+    def believing(self, priors: Mapping[int, NDArray[np.float64]]) -> ParameterMap:
+        """The same with the precisions (n, n) of some blocks, by their numbers."""
         precision, n = self.nuisance_precision.copy(), self.n_parameters
-        for i, block in enumerate(self.blocks):
-            if block.released:
-                own = self.columns(i) - n
-                precision[np.ix_(own, own)] = block.precision
-        blocks = tuple(replace(block, released=False) for block in self.blocks)
-        return replace(self, blocks=blocks, nuisance_precision=precision)
+        for number, own in priors.items():
+            columns = self.columns(number) - n
+            precision[np.ix_(columns, columns)] = own
+        return replace(self, nuisance_precision=precision)
+
+    def choosing(self, chosen: Mapping[int, int]) -> ParameterMap:
+        """The same with the alternative priors of blocks, by the numbers of both."""
+        every = {i: self.blocks[i].alternatives[k].covariance for i, k in chosen.items()}
+        return self.believing({i: np.asarray(np.linalg.inv(covariance)) for i, covariance in every.items()})
+
+    def of_image(self, state: int) -> NDArray[np.int64]:
+        """Numbers (n,) of the unknowns of how a later image moves and is drawn, which no other image has."""
+        own = (Acts.BOUNDARY, Acts.RESIDUALS)
+        places = [self.columns(i) for i, b in enumerate(self.blocks) if b.acts in own and b.states == (state,)]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *places])
 
     def with_prior(self, mean: NDArray[np.float64], sd: NDArray[np.float64]) -> ParameterMap:
         """The same with a normal prior of theta: mean and standard deviation (n_parameters,), inf where it is flat.

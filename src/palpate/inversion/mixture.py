@@ -1,0 +1,328 @@
+"""The posterior of the log-moduli: a mixture over all that may explain the later images.
+
+Under each explanation, a scenario of the tissues with the alternatives of every later image (see `scenarios`), the
+posterior is nearly normal. The probability of an explanation is its evidence, by Laplace's approximation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from palpate.approximation.contract import determined
+from palpate.errors import EstimationError, SolverError
+from palpate.inversion.by_image import Images, among, log_determinant
+from palpate.inversion.frozen_posterior import Posterior
+from palpate.inversion.objective import Evaluation
+from palpate.inversion.optimise import Bounds, Minimum, gauss_newton, same_minimum
+from palpate.inversion.scenarios import Alternatives, alternatives_of, scenarios_of
+from palpate.parallel import mapped
+from palpate.unknowns.parameters import ParameterMap
+
+TRUSTED_SD = 0.5  # of ln E: how far residuals are taken for linear where explanations are compared first
+SEEN = 6.0  # of the log-evidence: explanations that are less likely than the best one by so much are left out
+MOST = 40  # explanations whose minimum is sought on the model, of all later images together
+FEWEST = 6  # the same, however many later images there are
+ROUNDS = 4  # over all images, to find the likeliest alternatives of each
+MINIMUM = 1e-2  # decrement at which the minimum of an explanation ends
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """A scenario with the alternatives of every later image, its probability, and the posterior of theta under it.
+
+    chosen: numbers of the alternatives, by block; scenario, images: in words; theta (n_parameters,) and covariance
+    (n_parameters, n_parameters): of the log-moduli, normal.
+    """
+
+    chosen: Mapping[int, int]
+    scenario: tuple[str, ...]
+    images: tuple[tuple[str, ...], ...]
+    weight: float
+    theta: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Mixture:
+    """The posterior of theta: explanations with their weights, the likeliest first, which add up to 1.
+
+    minimum: that of the likeliest one, of all unknowns.
+    """
+
+    explanations: tuple[Explanation, ...]
+    minimum: Minimum = field(repr=False)
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """(n,) of the explanations."""
+        return np.array([of.weight for of in self.explanations])
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        """(n_parameters,) of theta."""
+        return np.asarray(self.weights @ np.stack([of.theta for of in self.explanations]))
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """(n_parameters, n_parameters) of theta: within explanations and between them."""
+        away = np.stack([of.theta for of in self.explanations]) - self.mean
+        within = np.tensordot(self.weights, np.stack([of.covariance for of in self.explanations]), axes=1)
+        return np.asarray(within + (away.T * self.weights) @ away)
+
+    @property
+    def sd(self) -> NDArray[np.float64]:
+        """(n_parameters,) of theta."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def probabilities(self, block: int) -> dict[int, float]:
+        """Of the alternatives of a block that has any, by their numbers."""
+        found = dict[int, float]()
+        for of in self.explanations:
+            if block in of.chosen:
+                found[of.chosen[block]] = found.get(of.chosen[block], 0.0) + of.weight
+        return found
+
+
+def mixture_of(
+    posterior: Posterior,
+    unknowns: NDArray[np.float64],
+    evaluation: Evaluation,
+    bounds: Bounds,
+    *,
+    begins: Sequence[NDArray[np.float64]] = (),
+    most: int = MOST,
+) -> Mixture:
+    """The posterior of theta over all explanations.
+
+    First every explanation is compared with the residuals linear around unknowns (n_unknowns,), within `TRUSTED_SD`
+    there (see `LinearEvidence`). Then the minimum of the likeliest, `most` at most, is found on the `posterior`,
+    however far, with the evidence there. begins (n_unknowns,) each: where further minima of the likeliest explanation
+    are sought. Raises `EstimationError` where images and prior leave an unknown open, or no minimum can be solved for.
+    """
+    n = posterior.n_parameters
+    with determined():
+        compared = LinearEvidence.of(posterior.parameters, evaluation, unknowns).compared(most)
+    jobs = [(of, of.unknowns) for of in compared]
+    found = [each for each in mapped(lambda job: _laplace(posterior, *job, bounds), jobs) if each is not None]
+    if not found:
+        raise EstimationError("the model cannot be solved near any explanation of the images; check images and mesh")
+    likeliest = max(found, key=lambda each: each.level)
+    for each in mapped(lambda begin: _laplace(posterior, likeliest.of, begin, bounds), begins):
+        others = [other.minimum for other in found if other.of is likeliest.of]
+        if each is not None and not any(same_minimum(each.minimum.unknowns, other, n) for other in others):
+            found.append(each)
+    found.sort(key=lambda each: -each.level)
+    weights = np.exp([each.level - found[0].level for each in found])
+    weights /= weights.sum()
+    explanations = [
+        Explanation(
+            dict(each.of.chosen),
+            each.of.scenario,
+            each.of.images,
+            float(weight),
+            each.minimum.unknowns[:n],
+            each.minimum.evaluation.covariance_columns(n)[:n],
+        )
+        for each, weight in zip(found, weights, strict=True)
+    ]
+    return Mixture(tuple(explanations), found[0].minimum)
+
+
+@dataclass(frozen=True, slots=True)
+class _Compared:
+    """An explanation on linear residuals: its choices, in words too, its minimum (n_unknowns,) and log-evidence.
+
+    log_prior: log prior odds of its alternatives; several: what combinations of alternatives of several images add,
+    which are none of the compared ones.
+    """
+
+    chosen: tuple[tuple[int, int], ...]
+    scenario: tuple[str, ...]
+    images: tuple[tuple[str, ...], ...]
+    unknowns: NDArray[np.float64]
+    evidence: float
+    log_prior: float
+    several: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Laplace:
+    """The minimum of an explanation on the model, and the log of its probability but for a constant."""
+
+    of: _Compared
+    minimum: Minimum
+    level: float
+
+
+def _laplace(posterior: Posterior, of: _Compared, begin: NDArray[np.float64], bounds: Bounds) -> _Laplace | None:
+    """An explanation's minimum, sought from unknowns (n_unknowns,); None where the model cannot be solved there.
+
+    The log-evidence is -J - 1/2 ln det H + 1/2 ln det P, H = J^T W J + P.
+    """
+    parameters = posterior.parameters.choosing(dict(of.chosen))
+    n, start = parameters.n_parameters, begin.copy()
+    start[:n] = np.clip(start[:n], bounds.lower, bounds.upper)
+    try:
+        minimum = gauss_newton(posterior.believing(parameters), start, bounds=bounds, tolerance=MINIMUM)
+    except SolverError:
+        return None
+    if not np.isfinite(minimum.evaluation.value):
+        return None
+    there, images = minimum.evaluation, parameters.images
+    determinants = log_det(parameters.nuisance_precision, tuple(own - n for own in images)) - log_det(
+        there.matrix, images
+    )
+    return _Laplace(of, minimum, of.log_prior + of.several + 0.5 * determinants - there.value)
+
+
+def log_det(matrix: NDArray[np.float64], images: Images = ()) -> float:
+    """Ln det of a positive definite matrix (n, n), without the unknowns that nothing depends on."""
+    seen = np.diag(matrix) > 0.0
+    return log_determinant(matrix[np.ix_(seen, seen)], among(images, seen)) if seen.any() else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Eliminated:
+    """What an image's own unknowns y, under one of its alternatives, take from the shared ones.
+
+    across (n_own, n_shared): X = (A_yy + P)^-1 A_ys; own (n_own,): z = (A_yy + P)^-1 b_y; taken (n_shared, n_shared)
+    and pull (n_shared,): A_sy X and A_sy z; level: 1/2 (b_y^T z - ln det(A_yy + P) + ln det P) with the log prior odds.
+    """
+
+    across: NDArray[np.float64]
+    own: NDArray[np.float64]
+    taken: NDArray[np.float64]
+    pull: NDArray[np.float64]
+    level: float
+
+
+@dataclass(frozen=True, slots=True)
+class LinearEvidence:
+    """The log-evidence of explanations on residuals that are linear in all unknowns.
+
+    information (n_shared, n_shared) and pull (n_shared,) of the unknowns that several images share, whose numbers are
+    `shared` (n_shared,); images: of each the alternatives, and what each takes when its own unknowns follow.
+    """
+
+    parameters: ParameterMap
+    shared: NDArray[np.int64]
+    information: NDArray[np.float64]
+    pull: NDArray[np.float64]
+    images: tuple[tuple[tuple[Alternatives, _Eliminated], ...], ...]
+
+    @classmethod
+    def of(cls, parameters: ParameterMap, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> LinearEvidence:
+        """That of residuals linear around unknowns (n_unknowns,), where moduli are trusted within `TRUSTED_SD`."""
+        n, data = parameters.n_parameters, evaluation.matrix - evaluation.prior
+        pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
+        data[np.arange(n), np.arange(n)] += TRUSTED_SD**-2.0
+        pull[:n] += TRUSTED_SD**-2.0 * unknowns[:n]
+        owns = [parameters.of_image(state) for state in range(parameters.n_states)]
+        shared = np.setdiff1d(np.arange(len(pull)), np.concatenate(owns))
+        images = [tuple(cls._eliminated(parameters, data, pull, s, own, shared)) for s, own in enumerate(owns)]
+        return cls(parameters, shared, data[np.ix_(shared, shared)], pull[shared], tuple(images))
+
+    @staticmethod
+    def _eliminated(
+        parameters: ParameterMap,
+        data: NDArray[np.float64],
+        pull: NDArray[np.float64],
+        state: int,
+        own: NDArray[np.int64],
+        shared: NDArray[np.int64],
+    ) -> Iterator[tuple[Alternatives, _Eliminated]]:
+        """Each alternative of a later state with what its own unknowns take."""
+        across, information, centre = data[np.ix_(own, shared)], data[np.ix_(own, own)], parameters.prior_centre[own]
+        for alternatives in alternatives_of(parameters.blocks, state):
+            prior = parameters.choosing(dict(alternatives.chosen)).prior_matrix[np.ix_(own, own)]
+            pulled = pull[own] + prior @ centre
+            factor = linalg.cho_factor(information + prior, lower=True, check_finite=False)
+            answer = linalg.cho_solve(factor, np.column_stack([across, pulled]), check_finite=False)
+            determinants = log_det(prior) - 2.0 * float(np.log(np.diag(factor[0])).sum())
+            level = 0.5 * (float(pulled @ answer[:, -1]) - float(centre @ prior @ centre) + determinants)
+            taken = across.T @ answer
+            yield (
+                alternatives,
+                _Eliminated(
+                    answer[:, :-1], answer[:, -1], taken[:, :-1], taken[:, -1], level + alternatives.log_odds
+                ),
+            )
+
+    def compared(self, most: int) -> list[_Compared]:
+        """The likeliest explanations, `most` at most: of each scenario the likeliest, and all others of one image.
+
+        Of several images the alternatives of each are chosen in turn, beside those of the others.
+        """
+        found, fewest = list[_Compared](), max(most // max(len(self.images), 1), FEWEST)
+        for scenario in scenarios_of(self.parameters.blocks):
+            found += self._of_scenario(scenario)
+        best = max(of.evidence for of in found)
+        found = sorted((of for of in found if of.evidence > best - SEEN), key=lambda of: -of.evidence)
+        return found[:fewest]
+
+    def _of_scenario(self, scenario: Alternatives) -> list[_Compared]:
+        """Its likeliest explanation, and those that differ in one image and are seen beside it."""
+        parameters, shared = self.parameters.choosing(dict(scenario.chosen)), self.shared
+        prior, centre = parameters.prior_matrix[np.ix_(shared, shared)], parameters.prior_centre[shared]
+        n = parameters.n_parameters
+        own = 0.5 * (log_det(prior[n:, n:]) - float(centre @ prior @ centre)) + scenario.log_odds
+        information, pull = self.information + prior, self.pull + prior @ centre
+
+        def evidence(numbers: Sequence[int]) -> float:
+            """The log-evidence of alternatives by their number in each image."""
+            parts = [image[k][1] for image, k in zip(self.images, numbers, strict=True)]
+            factor = linalg.cholesky(information - sum(part.taken for part in parts), lower=True, check_finite=False)
+            target = linalg.solve_triangular(
+                factor, pull - sum(part.pull for part in parts), lower=True, check_finite=False
+            )
+            level = 0.5 * float(target @ target) - float(np.log(np.diag(factor)).sum())
+            return level + own + sum(part.level for part in parts)
+
+        def others(numbers: tuple[int, ...], k: int) -> dict[tuple[int, ...], float]:
+            """All explanations that differ from one in image k alone, and itself."""
+            every = [(*numbers[:k], i, *numbers[k + 1 :]) for i in range(len(self.images[k]))]
+            return {each: evidence(each) for each in every}
+
+        numbers = tuple(max(range(len(image)), key=lambda i: image[i][1].level) for image in self.images)
+        by_image = [others(numbers, k) for k in range(len(self.images))]
+        for _ in range(ROUNDS if len(self.images) > 1 else 1):
+            before = numbers
+            for k in range(len(self.images)):
+                by_image[k] = others(numbers, k)
+                numbers = max(by_image[k], key=lambda each: by_image[k][each])
+            if numbers == before:
+                break
+        by_image = [others(numbers, k) for k in range(len(self.images))] if len(self.images) > 1 else by_image
+        levels = {each: level for of in by_image for each, level in of.items()} or {(): evidence(())}
+        best = levels[numbers]
+        product = sum(float(np.log(np.sum(np.exp(np.array(list(of.values())) - best)))) for of in by_image)
+        several = product - float(np.log(np.sum(np.exp(np.array(list(levels.values())) - best))))
+        seen = [(each, level) for each, level in levels.items() if level > best - SEEN]
+        return [self._compared(scenario, each, level + several, several, prior, pull) for each, level in seen]
+
+    def _compared(
+        self,
+        scenario: Alternatives,
+        numbers: Sequence[int],
+        evidence: float,
+        several: float,
+        prior: NDArray[np.float64],
+        pull: NDArray[np.float64],
+    ) -> _Compared:
+        """One explanation with its minimum (n_unknowns,)."""
+        parts = [image[k] for image, k in zip(self.images, numbers, strict=True)]
+        matrix = self.information + prior - sum(part.taken for _, part in parts)
+        of_shared = linalg.solve(matrix, pull - sum(part.pull for _, part in parts), assume_a="pos")
+        unknowns = np.empty(self.parameters.n_unknowns)
+        unknowns[self.shared] = of_shared
+        for state, (_, part) in enumerate(parts):
+            unknowns[self.parameters.of_image(state)] = part.own - part.across @ of_shared
+        chosen = scenario.chosen + tuple(pair for of, _ in parts for pair in of.chosen)
+        odds = scenario.log_odds + sum(of.log_odds for of, _ in parts)
+        words = tuple(of.words for of, _ in parts)
+        return _Compared(chosen, scenario.words, words, unknowns, evidence, odds, several)

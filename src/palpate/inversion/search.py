@@ -1,0 +1,210 @@
+"""The search for the posterior: make the models exact, compare all explanations, go where they lead, repeat.
+
+It is the same for the linear and for a finite-strain law, and for every approximation of the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.approximation.contract import updated
+from palpate.approximation.expansion import Expansion
+from palpate.errors import EstimationError, NotConverged, SolverError
+from palpate.inversion.frozen_posterior import Posterior, cheapest_posterior
+from palpate.inversion.hyper_parameters import with_amplitudes, with_correlations, with_scales
+from palpate.inversion.mixture import Mixture, mixture_of
+from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
+from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, gauss_newton
+from palpate.mechanics.equilibrium import ACCURACY
+from palpate.mechanics.forward import SolveCounts
+from palpate.progress import Progress
+
+RADIUS = 1.5  # of ln E: longest step
+FITS = 3  # of noise and amplitudes in an iteration, with the residuals linear
+NEAR = 1e-3  # decrement of a minimum on linear residuals
+HALVINGS = 5  # of a step that leads to a state which cannot be solved, or to a worse fit
+WORSE = 2.0  # rise of J at which a step is halved: closest points that slide over voxels make less
+FLOOR = 3e-4  # of ln E: a move that is always short enough
+FEW = 8  # explanations that are compared while the search is far from its end
+
+
+@dataclass(frozen=True, slots=True)
+class StopRule:
+    """When a search ends: where the posterior's mean moves by less than so many standard deviations of its own.
+
+    iterations: the largest number.
+    """
+
+    step_sd: float = 0.05
+    iterations: int = 25
+
+
+REPORTED = StopRule()  # of an estimate
+ROUGH = StopRule(step_sd=0.3)  # of a search that goes on under another law
+
+
+@dataclass(frozen=True, slots=True)
+class Searched:
+    """Where a search is: the objective, all unknowns with their evaluation, and the posterior as it is known there.
+
+    The evaluation is that under the likeliest explanation. mixture: None before the first iteration. settled: whether
+    the noise is fitted, after which the objective stays as it is. moved: by how many of its standard deviations the
+    mean moved last.
+    """
+
+    objective: Objective
+    minimum: Minimum
+    mixture: Mixture | None = None
+    settled: bool = False
+    moved: float = np.inf
+
+    @property
+    def posterior(self) -> Mixture:
+        """The mixture. Raises `EstimationError` before the first iteration."""
+        if self.mixture is None:
+            raise EstimationError("no posterior is known before the first iteration of the search")
+        return self.mixture
+
+    @property
+    def counts(self) -> SolveCounts:
+        """What the full models have cost."""
+        return sum((approximation.counts for approximation in self.objective.approximations), SolveCounts())
+
+    def cheapest(self) -> Posterior:
+        """The objective with the closest points and weights of the evaluation."""
+        return cheapest_posterior(self.objective, self.minimum.unknowns, self.minimum.evaluation)
+
+    def at_equilibrium(self) -> Searched:
+        """The same at exact equilibria of its expansions."""
+        exact, at = list[Expansion](), self.minimum
+        points = self.objective.linearisation_points(at.unknowns)
+        for approximation, point in zip(self.objective.approximations, points, strict=True):
+            assert isinstance(approximation, Expansion)
+            exact.append(approximation.at_equilibrium(point, tolerance=ACCURACY))
+        objective = self.objective.under(exact)
+        minimum = replace(at, evaluation=objective(at.unknowns), evaluations=at.evaluations + 1)
+        return replace(self, objective=objective, minimum=minimum)
+
+
+def begun(
+    objective: Objective, unknowns: NDArray[np.float64], *, history: tuple[Iterate, ...] = (), evaluations: int = 0
+) -> Searched:
+    """Where a search begins: an objective matched, and evaluated, at unknowns (n_unknowns,).
+
+    history, evaluations: the way there, and what it cost.
+    """
+    objective = objective.rematched(unknowns)
+    evaluation = objective(unknowns)
+    history = (*history, Iterate.of(unknowns, evaluation, objective.n_parameters))
+    return Searched(objective, Minimum(unknowns, evaluation, Outcome.STEPS, history, evaluations + 1))
+
+
+def searched(
+    begin: Searched,
+    bounds: Bounds,
+    rule: StopRule,
+    *,
+    progress: Progress,
+    title: str,
+    begins: Sequence[NDArray[np.float64]] = (),
+) -> Searched:
+    """The search followed from where it has `begun` until the posterior's mean moves no more by the `rule`.
+
+    While a step is longer than a standard deviation the noise is fitted anew; with the first shorter one it stays, and
+    so does the objective. begins (n_unknowns,) each: where further minima are sought. A search that does not end by its
+    rule says so in its minimum's outcome. Raises `EstimationError`s of models that cannot be solved.
+    """
+    now = begin
+    for number in range(1, rule.iterations + 1):
+        progress(f"{title}, iteration {number}: {now.objective.parameters.in_words(now.minimum.unknowns)}")
+        now = _iteration(now, bounds, rule, begins)
+        if now.minimum.outcome is not Outcome.STEPS:
+            break
+    return now
+
+
+def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[NDArray[np.float64]]) -> Searched:
+    """The posterior with the models exact where the search is, and the search where its mean leads."""
+    n, at = now.objective.n_parameters, now.minimum
+    theta = at.unknowns[:n]
+    radius = min([RADIUS, *(approximation.trust_radius for approximation in now.objective.approximations)])
+    near = Bounds(np.maximum(bounds.lower, theta - radius), np.minimum(bounds.upper, theta + radius))
+    objective, evaluation = _fitted(now, near)
+    posterior = cheapest_posterior(objective, at.unknowns, evaluation)
+    exact = now.settled and now.moved < 1.0
+    few = {} if exact else {"most": FEW}
+    mixture = mixture_of(posterior, at.unknowns, evaluation, bounds if exact else near, begins=begins, **few)
+    objective = objective.believing(objective.parameters.choosing(mixture.explanations[0].chosen))
+    sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
+    moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
+    target = _target(posterior, objective, mixture, near)
+    if exact and moved < rule.step_sd:
+        evaluation = evaluation.under(objective.parameters, at.unknowns)
+        minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
+        return replace(now, objective=objective, minimum=minimum, mixture=mixture, moved=moved)
+    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=now.settled or moved < 1.0)
+    return _taken(before, evaluation, target)
+
+
+def _fitted(now: Searched, near: Bounds) -> tuple[Objective, Evaluation]:
+    """The objective with the noise that the residuals show, and the evaluation with the robust weights there.
+
+    Both by the minimum on residuals that are linear around where the search is, under the present explanation.
+    """
+    at, objective = now.minimum, now.objective
+    for _ in range(1 if now.settled else FITS):
+        linear = LinearisedObjective(objective, at.unknowns, at.evaluation)
+        found = gauss_newton(linear, at.unknowns, bounds=near, tolerance=NEAR)
+        if not now.settled:
+            objective = with_scales(with_correlations(objective, found.evaluation), found.evaluation)
+            here = LinearisedObjective(objective, at.unknowns, at.evaluation)(found.unknowns)
+            objective = with_amplitudes(objective, here, found.unknowns)
+    like = LinearisedObjective(objective, at.unknowns, at.evaluation)(found.unknowns).linearisations
+    return objective, objective.weighed(at.unknowns, at.evaluation.linearisations, like)
+
+
+def _target(posterior: Posterior, objective: Objective, mixture: Mixture, near: Bounds) -> NDArray[np.float64]:
+    """Unknowns (n_unknowns,) at the mean of theta, all others at their best under the likeliest explanation."""
+    n = objective.n_parameters
+    theta = np.clip(mixture.mean, near.lower, near.upper)
+    start = np.concatenate([theta, mixture.minimum.unknowns[n:]])
+    own = posterior.believing(objective.parameters)
+    return gauss_newton(own, start, bounds=Bounds(theta, theta), tolerance=NEAR).unknowns
+
+
+def _taken(now: Searched, evaluation: Evaluation, target: NDArray[np.float64]) -> Searched:
+    """The search at a target (n_unknowns,), or nearer where its state cannot be solved or fits worse."""
+    at, objective, evaluations, failure = now.minimum, now.objective, now.minimum.evaluations, None
+    before = evaluation.under(objective.parameters, at.unknowns).value
+    for _ in range(HALVINGS):
+        try:
+            there = _exact(objective, evaluation.under(objective.parameters, at.unknowns), target)
+        except (NotConverged, SolverError) as error:
+            failure, target = error, at.unknowns + 0.5 * (target - at.unknowns)
+            continue
+        failure, reached, evaluations = None, there(target), evaluations + 1
+        if reached.value < before + WORSE or not now.settled:
+            history = (*at.history, Iterate.of(target, reached, objective.n_parameters))
+            return replace(now, objective=there, minimum=Minimum(target, reached, Outcome.STEPS, history, evaluations))
+        target = at.unknowns + 0.5 * (target - at.unknowns)
+    if failure is not None:
+        raise failure
+    return replace(now, minimum=replace(at, outcome=Outcome.STUCK, evaluations=evaluations))
+
+
+def _exact(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
+    """The objective matched at unknowns (n_unknowns,), its models exact there along the directions that decide.
+
+    These are those of the evaluation nearby, with layers and without.
+    """
+    wide = dict[int, int]()
+    for i, block in enumerate(objective.parameters.blocks):
+        if block.choice.of_tissues:
+            wide[i] = len(block.alternatives) - 1
+    other = evaluation.under(objective.parameters.choosing(wide), unknowns)
+    points = objective.linearisation_points(unknowns, [evaluation, other] if wide else [evaluation])
+    return objective.under(updated(objective.approximations, points)).rematched(unknowns)

@@ -1,0 +1,157 @@
+"""What is stated of each log-modulus: a mixture of the normal laws of all explanations, its quantiles and causes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, special
+
+from palpate.inversion import Bounds, Mixture
+from palpate.uncertainty.covariance import Covariance
+from palpate.uncertainty.intervals import Interval
+from palpate.uncertainty.profile import Profile
+from palpate.unknowns import Block, Choice
+
+CORRELATED = 1.5  # largest factor on a standard deviation by which residuals that are alike over surfaces count
+TAIL = 0.025  # on either side of a 95 % interval
+CAUSES = {Choice.PATCHINESS: "heterogeneity", Choice.LAYERS: "layer", Choice.FRAME: "frame", Choice.DRAWING: "offset"}
+TABLE = 4001  # places of ln E at which the coordinate is tabulated
+FLAT = 0.1  # least slope of a profile's root deviance beyond its end, over that at the estimate
+
+
+@dataclass(frozen=True, slots=True)
+class StatedMixture:
+    """The posterior with all that is known of its errors: weights (k,), theta (k, n), covariances (k, n, n).
+
+    covariance: of the whole, by cause.
+    """
+
+    weights: NDArray[np.float64]
+    theta: NDArray[np.float64]
+    covariances: NDArray[np.float64]
+    covariance: Covariance
+
+    def draws(self, number: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """So many explanations (number,), and how far theta (number, n) lies from the estimate of each."""
+        which = rng.choice(len(self.weights), size=number, p=self.weights)
+        roots = np.stack([np.linalg.cholesky(covariance) for covariance in self.covariances])
+        normal = rng.standard_normal((number, self.theta.shape[1]))
+        return which, np.asarray(np.einsum("dij,dj->di", roots[which], normal))
+
+
+def stated_mixture(mixture: Mixture, own: Covariance, blocks: tuple[Block, ...]) -> StatedMixture:
+    """A mixture whose explanations have the errors of the likeliest one, `own`, beside those of the posterior.
+
+    Residuals are alike over surfaces in other ways than their number says: with the sandwich C_s and the posterior's
+    covariance C of the likeliest explanation, every standard deviation is larger by the factor (C_s / C)^(1/2), 1 to
+    `CORRELATED`. What blocks that are held, the voxels' place and the mesh add is the same in all. Between explanations
+    the variance is that of their means (law of total variance), told by what distinguishes them.
+    """
+    first, held = mixture.explanations[0], sum(own.held.values(), np.zeros_like(own.prior))
+    sandwich, posterior = np.diag(own.noise + own.prior - held), np.diag(first.covariance)
+    factor = np.clip(np.sqrt(sandwich / posterior), 1.0, CORRELATED)
+    further = held + own.grid + own.mesh
+    every = np.stack([np.outer(factor, factor) * of.covariance for of in mixture.explanations])
+    weights, theta = mixture.weights, np.stack([of.theta for of in mixture.explanations])
+    within = np.tensordot(weights, every, axes=1)
+    scale = np.sqrt(np.diag(within) / sandwich)
+    scaled = np.outer(scale, scale)
+    between, causes = _between(mixture, blocks), dict[str, NDArray[np.float64]]()
+    for cause, part in own.causes.items():
+        of_held = own.held.get(cause, np.zeros_like(part))
+        causes[cause] = (part - of_held) * scaled + of_held
+    for cause, part in between.items():
+        causes[cause] = causes.get(cause, np.zeros_like(part)) + part
+    prior = (own.prior - held) * scaled + held + sum(between.values(), np.zeros_like(own.prior))
+    whole = replace(own, noise=own.noise * scaled, prior=prior, causes=causes)
+    return StatedMixture(weights, theta, every + further, whole)
+
+
+def _between(mixture: Mixture, blocks: tuple[Block, ...]) -> Mapping[str, NDArray[np.float64]]:
+    """Covariance (n, n) between explanations, by the causes of the blocks whose alternatives distinguish them."""
+    theta, weights = np.stack([of.theta for of in mixture.explanations]), mixture.weights
+    away = theta - mixture.mean
+    whole, parts = (away.T * weights) @ away, dict[str, NDArray[np.float64]]()
+    for choice, cause in CAUSES.items():
+        own = [i for i, block in enumerate(blocks) if block.choice is choice]
+        keys = [tuple(of.chosen.get(i, 0) for i in own) for of in mixture.explanations]
+        means = np.zeros_like(away)
+        for key in set(keys):
+            alike = np.array([each == key for each in keys])
+            means[alike] = weights[alike] @ away[alike] / max(float(weights[alike].sum()), np.finfo(float).tiny)
+        parts[cause] = (means.T * weights) @ means
+    total = np.sqrt(np.maximum(sum(np.diag(part) for part in parts.values()), np.finfo(float).tiny))
+    found = {}
+    for cause, part in parts.items():
+        share = np.sqrt(np.diag(part)) / total
+        found[cause] = whole * np.outer(share, share)
+    rest = whole - sum(found.values(), np.zeros_like(whole))
+    if np.diag(rest).max(initial=0.0) > 0.0:
+        found["minima"] = rest
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Marginal:
+    """The posterior of one log-modulus: a mixture of laws that are normal in the coordinate of a profile.
+
+    weights, theta, sd (k,) of the explanations; profile: of the likeliest one, whose signed root deviance r is a
+    coordinate in which that one's posterior is normal, where ln E is none; spread: its standard deviation.
+    """
+
+    weights: NDArray[np.float64]
+    theta: NDArray[np.float64]
+    sd: NDArray[np.float64]
+    profile: Profile
+    spread: float
+
+    def coordinate(self, theta: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """The coordinate (n,) of ln E, as long as ln E at the estimate: the spread times r, beyond its ends a line."""
+        places, roots = self.profile.theta, np.maximum.accumulate(self.profile.root)
+        there = np.atleast_1d(np.asarray(theta, dtype=np.float64))
+        if len(places) < 2:
+            return there - self.theta[0]
+        found = self.spread * np.interp(there, places, roots)
+        for end, side, inner in ((0, there < places[0], 1), (-1, there > places[-1], -2)):
+            steps = places[end] - places[inner]
+            slope = self.spread * (roots[end] - roots[inner]) / steps if steps else 1.0
+            found[side] += max(float(slope), FLAT) * (there[side] - places[end])
+        return np.asarray(found)
+
+    def at(self, which: NDArray[np.int64], away: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Ln E (n,) that lie `away` (n,) from the estimates of explanations `which` (n,) in the coordinate; by a table."""
+        places = self.coordinate(self.theta)[which] + away
+        reach = float(np.abs(away).max(initial=0.0)) / FLAT
+        table = np.linspace(float(self.theta.min()) - reach, float(self.theta.max()) + reach, TABLE)
+        return np.asarray(np.interp(places, self.coordinate(table), table))
+
+    def quantile(self, probability: float, bounds: tuple[float, float]) -> float | None:
+        """Ln E below which it lies with a probability; None beyond the bounds of the search."""
+        centres = self.coordinate(self.theta)
+
+        def excess(theta: float) -> float:
+            """The probability of a smaller ln E, less that."""
+            away = (self.coordinate(theta)[0] - centres) / self.sd
+            return float(self.weights @ special.ndtr(away)) - probability
+
+        low, high = bounds
+        if excess(low) >= 0.0 or excess(high) <= 0.0:
+            return None
+        return float(optimize.brentq(excess, low, high, xtol=1e-6))
+
+    def interval(self, bounds: tuple[float, float]) -> Interval:
+        """The equal-tailed 95 % interval of E as a ratio to the scale; an end beyond the bounds is open."""
+        low, high = self.quantile(TAIL, bounds), self.quantile(1.0 - TAIL, bounds)
+        return (None if low is None else float(np.exp(low)), None if high is None else float(np.exp(high)))
+
+
+def marginals_of(stated: StatedMixture, profiles: tuple[Profile, ...]) -> tuple[Marginal, ...]:
+    """That of each parameter, by the `profiles` of the likeliest explanation."""
+    found = []
+    for i, profile in enumerate(profiles):
+        sd = np.sqrt(stated.covariances[:, i, i])
+        found.append(Marginal(stated.weights, stated.theta[:, i], sd, profile, float(sd[0])))
+    return tuple(found)
