@@ -32,14 +32,12 @@ class Role(StrEnum):
 class FieldPrior:
     """The prior of ln E inside a tissue whose modulus is a field.
 
-    sd: standard deviation, dimensionless; length_mm: of its kernel, Matern's with one derivative, mm.
-    total_variation: whether it is not Gaussian, but has its total variation, on the scale of both, for a prior: the
-    field may have edges. modes: so many of the kernel's make it at the most.
+    sd: standard deviation, dimensionless; length_mm: of its kernel, Matern's with one derivative, mm; modes: so many of
+    the kernel's make it at the most.
     """
 
     sd: float
     length_mm: float
-    total_variation: bool = False
     modes: int = 400
 
 

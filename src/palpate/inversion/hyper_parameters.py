@@ -48,8 +48,7 @@ def with_hyper_parameters(objective: Objective, evaluation: Evaluation, unknowns
 
     Raises `EstimationError` where the images do not determine a block's motion.
     """
-    learned = with_amplitudes(with_scales(objective, evaluation), evaluation, unknowns)
-    return with_edges(learned, evaluation, unknowns)
+    return with_amplitudes(with_scales(objective, evaluation), evaluation, unknowns)
 
 
 def with_scales(objective: Objective, evaluation: Evaluation) -> Objective:
@@ -59,7 +58,7 @@ def with_scales(objective: Objective, evaluation: Evaluation) -> Objective:
     1992): s^2 = n rho / (n - g) of a mean square rho where no outlier is.
     """
     linearisations, found, inverse = evaluation.linearisations, dict[int, float](), np.zeros_like(evaluation.matrix)
-    matrix = evaluation.matrix - evaluation.prior + objective.as_normal(evaluation)[0]
+    matrix = evaluation.matrix
     seen = np.flatnonzero(np.diag(matrix) > 0.0)
     with determined():
         within = np.ix_(seen, seen)
@@ -221,34 +220,6 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
             model = model.believing(i, taken.covariance)
     parameters = replace(parameters, nuisance_precision=model.prior[n:, n:])
     return replace(objective, parameters=parameters, chosen=tuple(chosen))
-
-
-def with_edges(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
-    """The objective whose blocks of a total variation have the normal law that is it to second order.
-
-    Where, with the residuals linear around unknowns (n_unknowns,), the block's x is likeliest, block after block, the
-    others following: with the gradient g and the curvature H there of minus the logarithm of what is believed, N(x -
-    H^-1 g, H^-1). The minimum is that of the variation itself, and its posterior Laplace's.
-    """
-    parameters, n = objective.parameters, objective.n_parameters
-    numbers = [i for i, block in enumerate(parameters.blocks) if block.variation]
-    if not numbers:
-        return objective
-    prior, centre = parameters.prior_matrix, parameters.prior_centre
-    model = normal_model(parameters, evaluation, unknowns)
-    of_data = model.pull - model.prior @ centre
-    for i in numbers:
-        columns, variation = parameters.columns(i), parameters.blocks[i].variation
-        assert variation is not None
-        centre[columns] = 0.0
-        with determined():
-            seen = _schur_complement(prior, model.data, of_data + prior @ centre, columns)
-            x = variation.least(*seen, unknowns[columns])
-            prior[np.ix_(columns, columns)] = curvature = variation.curvature(x)
-            away = linalg.solve(curvature, variation.gradient(x), assume_a="pos")
-        centre[columns] = x - away
-    believed = replace(parameters, nuisance_precision=prior[n:, n:], nuisance_mean=centre[n:])
-    return replace(objective, parameters=believed)
 
 
 def _admissible(blocks: Sequence[Block], number: int, chosen: Sequence[int | None]) -> Block:

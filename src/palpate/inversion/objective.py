@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from palpate.approximation.contract import Approximation, LinearisationPoint, determined
 from palpate.inversion.by_image import Images, among, log_determinant, solve_by_image
@@ -158,29 +157,11 @@ class Objective:
             kinds = {o.kind: o.weighting.sd for o in state.observations if not o.of_driver}
             drivers = [o for o in state.observations if o.of_driver and o.kind in kinds]
             residuals += sum(worse_driver(o.weighting.sd, kinds[o.kind]) for o in drivers)
-        normal, beyond = self.as_normal(evaluation)
         n = self.n_parameters
         images = self.parameters.images
-        posterior = log_det(evaluation.matrix - evaluation.prior + normal, images)
-        determinants = posterior - log_det(normal[n:, n:], tuple(own - n for own in images))
-        return evaluation.value + (residuals + beyond - sum(odds) + 0.5 * determinants)
-
-    def as_normal(self, evaluation: Evaluation) -> tuple[NDArray[np.float64], float]:
-        """Precision P (n_unknowns, n_unknowns) for the determinants; what J has beside the normal laws of `parameters`.
-
-        A total variation counts as it is where it was evaluated, and in the determinants as the normal law with which
-        it begins: its curvature has edges, which no smooth function of x follows.
-        """
-        normal, beyond = evaluation.prior, 0.0
-        for i, block in enumerate(self.parameters.blocks):
-            if block.variation:
-                own = self.parameters.columns(i)
-                away = linalg.solve(normal[np.ix_(own, own)], evaluation.prior_score[own], assume_a="pos")
-                x = self.parameters.prior_centre[own] + away
-                beyond += block.variation.value(x) - 0.5 * float(away @ evaluation.prior_score[own])
-                normal = normal.copy()
-                normal[np.ix_(own, own)] = block.precision
-        return normal, beyond
+        posterior = log_det(evaluation.matrix, images)
+        determinants = posterior - log_det(evaluation.prior[n:, n:], tuple(own - n for own in images))
+        return evaluation.value + (residuals - sum(odds) + 0.5 * determinants)
 
     @property
     def observations(self) -> list[Observation]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
-from palpate.report.report_data import MAP_OF, MESH, VARIATION, ReportData
+from palpate.report.report_data import MAP_OF, MESH, ReportData
 from palpate.report.rows import CAUSES, listed, moduli_in, ratio_rows
 from palpate.report.units import given_text
 from palpate.unknowns import KNOWN_MODULUS
@@ -134,8 +134,7 @@ def _model(data: ReportData, cite: Callable[[str], str]) -> str:
     if settings.get("body") == MESH:
         made = f"The mesh{size} was given."
     kernel = cite("kernel")
-    source = f" {cite('variation')}" if any(VARIATION in prior for prior in priors.values()) else ""
-    mapped = f" Inside {fields} ln E was a field{source}." if priors else ""
+    mapped = f" Inside {fields} ln E was a field." if priors else ""
     return (
         f"{made} The tissues followed"
         f" {law.description if law else 'the law ' + document['law']} in"

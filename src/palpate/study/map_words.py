@@ -24,10 +24,9 @@ def map_words(of: StiffnessMap) -> str:
             f" ({of.resolved:.0%} of the variance of ln E inside it is resolved)."
         )
     low, high = region.interval95
-    what = "it" if region.whole else "its core"
     place = ", ".join(f"{x:.0f}" for x in region.centre_mm)
     return (
-        f"A part of '{of.tissue}' differs: {region.volume_ml:.2g} mL about ({place}) mm; {what} is"
+        f"A part of '{of.tissue}' differs: {region.volume_ml:.2g} mL about ({place}) mm; its core is"
         f" {region.contrast:.2g} times as stiff as the rest of the tissue ({low or 0.0:.2g} to {high or 0.0:.2g}, 95 %"
         f"). That a place in it is more than {CONTRAST:g} times {'stiffer' if region.contrast > 1.0 else 'softer'} than"
         f" the tissue has a probability of up to {100.0 * region.probability:.3g} %."

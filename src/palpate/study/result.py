@@ -395,7 +395,7 @@ def _ratio(item: PoissonRatioEstimate, status: str) -> dict[str, Any]:
 
 def _map(of: StiffnessMap, names: Sequence[str]) -> dict[str, Any]:
     """What a map comes to; its numbers stand in mesh.vtu and in the images of stiffness."""
-    region = of.region and {key: value for key, value in _plain(of.region).items() if key not in ("elements", "whole")}
+    region = of.region and {key: value for key, value in _plain(of.region).items() if key != "elements"}
     return {
         "tissue": of.tissue,
         "after": names[of.state],

@@ -91,7 +91,8 @@ def read_table(kind: type[T], table: Mapping[str, object], *, where: str, folder
     keys = [*collected, *(name for name, bounds in rules.items() if not bounds.collects and not bounds.unwritten)]
     for key in table:
         if key not in keys:
-            raise ConfigurationError(f"unknown key '{shortened(key)}' in {where}: {nearest(key, keys)}")
+            hint = f"{nearest(key, keys)}; correct the key, or remove it"
+            raise ConfigurationError(f"unknown key '{shortened(key)}' in {where}: {hint}")
     _check_complete(fields.values(), table, where)
     hints = _hints(typing.cast("Any", kind))
     values: dict[str, Any] = {}

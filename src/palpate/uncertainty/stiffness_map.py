@@ -15,7 +15,7 @@ from palpate.mechanics.material import field_modes
 from palpate.mesh.tet_mesh import FACES, TetMesh
 from palpate.uncertainty.covariance import covariance_among
 from palpate.uncertainty.intervals import NORMAL_95, Interval
-from palpate.unknowns import FIELD, Acts, TotalVariation
+from palpate.unknowns import FIELD, Acts
 
 CONTRAST = 1.5  # least ratio for a part to have another stiffness than its tissue
 CERTAIN, LIKELY = 0.95, 0.5  # posterior probability of that: somewhere in a region that is reported, all over it
@@ -28,10 +28,9 @@ class DifferentRegion:
     """The largest connected part of a tissue that is likely stiffer, or softer, than the tissue by `CONTRAST`.
 
     elements (n,): its tetrahedra; volume_ml; centre_mm (3,), RAS; contrast: geometric mean of E where that is certain,
-    in its core (in all of it where the prior is a total variation, which keeps its border), over that outside of the
-    whole region, with its 95 % interval, as if nothing had been believed of how much it differs (what is believed draws
-    the map to the tissue's mean); probability: the largest posterior probability, of an element in it; whole: whether
-    the contrast is that of all of it.
+    in its core, over that outside of the whole region, with its 95 % interval, as if nothing had been believed of how
+    much it differs (what is believed draws the map to the tissue's mean); probability: the largest posterior
+    probability, of an element in it.
     """
 
     elements: NDArray[np.int64]
@@ -40,7 +39,6 @@ class DifferentRegion:
     contrast: float
     interval95: Interval
     probability: float
-    whole: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,19 +66,17 @@ class StiffnessMap:
 class _Field:
     """Posterior of a field at its elements: F x, and its covariance F C F^T + R R^T - F P^-1 F^T + r.
 
-    seen (n, k): F, the modes that the data tell, with coefficients x (k,) of covariance C (k, k), of a mean (k,) and a
-    covariance P^-1 (k, k) before them; every (n, m): R, all modes of the prior times its standard deviation; left (n,):
-    r, the variance that none of them holds; variation: the prior of which N(mean, P^-1) is the second order, if one is.
+    seen (n, k): F, the modes that the data tell, with coefficients x (k,) of covariance C (k, k), and of a covariance
+    P^-1 (k, k) before them; every (n, m): R, all modes of the prior times its standard deviation; left (n,): r, the
+    variance that none of them holds.
     """
 
     coefficients: NDArray[np.float64]
-    centre: NDArray[np.float64]
     seen: NDArray[np.float64]
     posterior: NDArray[np.float64]
     prior: NDArray[np.float64]
     every: NDArray[np.float64]
     left: NDArray[np.float64]
-    variation: TotalVariation | None = None
 
     @property
     def mean(self) -> NDArray[np.float64]:
@@ -102,39 +98,17 @@ class _Field:
         """The posterior with a flat prior along a `shape` (n,) of the field.
 
         With h the shape's coefficients, by volumes (n,), and P h = p: the prior's precision is P - p p^T / h^T p then,
-        so that x gains C p p^T (x - m) / d, m its mean, and C gains C p p^T C / d, d = p^T (h - C p) (Sherman and
-        Morrison 1950).
+        so that x gains C p p^T x / d, and C gains C p p^T C / d, d = p^T (h - C p) (Sherman and Morrison 1950).
         """
         weighted = volumes[:, None] * self.seen
         precision = np.asarray(np.linalg.inv(self.prior), dtype=np.float64)
         gram = weighted.T @ self.seen
         h = np.linalg.solve(gram + SMOOTH * np.trace(gram) / np.trace(precision) * precision, weighted.T @ shape)
-        if self.variation:
-            return self._varied_along(h, precision, self.variation)
         p = precision @ h
         back = self.posterior @ p
         share = max(float(p @ (h - back)), np.finfo(float).tiny)
-        x = self.coefficients + back * float(p @ (self.coefficients - self.centre)) / share
+        x = self.coefficients + back * float(p @ self.coefficients) / share
         return replace(self, coefficients=x, posterior=self.posterior + np.outer(back, back) / share)
-
-    def _varied_along(
-        self, h: NDArray[np.float64], precision: NDArray[np.float64], variation: TotalVariation
-    ) -> _Field:
-        """The same under a total variation, of the field less the multiple of the shape that lowers it most.
-
-        x = y + a h with a free and y under the prior, of data with the information A = C^-1 - P and the pull A x + P (x
-        - m): A' = A - A h h^T A / h^T A h is what they say of y, to second order about where it is likeliest.
-        """
-        sizes, axes = np.linalg.eigh(np.linalg.inv(self.posterior) - precision)
-        information = (axes * np.maximum(sizes, 0.0)) @ axes.T
-        pull = information @ self.coefficients + precision @ (self.coefficients - self.centre)
-        by_shape = information @ h
-        size = max(float(h @ by_shape), np.finfo(float).tiny)
-        others = information - np.outer(by_shape, by_shape) / size
-        y = variation.least(others, pull - by_shape * float(h @ pull) / size, self.coefficients)
-        along = np.eye(len(h)) - np.outer(h, by_shape) / size
-        posterior = along @ np.linalg.inv(others + variation.curvature(y)) @ along.T + np.outer(h, h) / size
-        return replace(self, coefficients=along @ y + h * float(h @ pull) / size, posterior=posterior)
 
     def variance_of(self, weights: NDArray[np.float64]) -> float:
         """Of the sum of the field times weights (n,)."""
@@ -166,16 +140,11 @@ def stiffness_maps(inversion: Inversion, variances: NDArray[np.float64]) -> tupl
         learned = np.asarray(np.linalg.inv(parameters.nuisance_precision[np.ix_(own - n, own - n)]), dtype=np.float64)
         stated = mesh.tissues[tissue].field
         assert stated is not None
-        sd = stated.sd
-        if not block.variation:
-            sd *= float(np.sqrt(np.trace(learned) / np.trace(np.linalg.inv(block.precision))))
+        sd = stated.sd * float(np.sqrt(np.trace(learned) / np.trace(np.linalg.inv(block.precision))))
         modes, volumes = field_modes(mesh, tissue, length_mm=stated.length_mm), mesh.volumes[elements]
         left = sd**2 * np.maximum(1.0 - (modes**2).sum(axis=1), 0.0)
         every = sd * (modes - (volumes @ modes) / volumes.sum())
-        if block.variation:  # all of its modes are unknowns
-            every = np.asarray(seen @ np.linalg.cholesky(learned))
-        centre = parameters.prior_centre[own]
-        field = _Field(minimum.unknowns[own], centre, seen, covariance[1:, 1:], learned, every, left, block.variation)
+        field = _Field(minimum.unknowns[own], seen, covariance[1:, 1:], learned, every, left)
         whole = field.variance + variances[theta] + 2.0 * seen @ covariance[1:, 0]
         resolution = np.clip(1.0 - field.variance / field.prior_variance, 0.0, 1.0)
         maps.append(
@@ -213,8 +182,8 @@ def _region(mesh: TetMesh, elements: NDArray[np.int64], field: _Field) -> Differ
         return None
     volume_ml, inside, probability = max(parts, key=lambda found: found[0])
     outside = ~np.isin(np.arange(len(elements)), inside)
-    # A normal law blurs the border, so only the core lies wholly in the part. A variation has a sharp border.
-    core = ~outside & ((probability > CERTAIN) | (field.variation is not None))
+    # The map is smooth, so only the core lies wholly in the part.
+    core = ~outside & (probability > CERTAIN)
     weights = core * volumes / volumes[core].sum() - outside * volumes / max(float(volumes[outside].sum()), 1e-300)
     free = field.free_along(core - np.average(core, weights=volumes), volumes)
     contrast, half = float(weights @ free.mean), NORMAL_95 * float(np.sqrt(free.variance_of(weights)))
@@ -226,5 +195,4 @@ def _region(mesh: TetMesh, elements: NDArray[np.int64], field: _Field) -> Differ
         float(np.exp(contrast)),
         (float(np.exp(contrast - half)), float(np.exp(contrast + half))),
         float(probability[inside].max()),
-        field.variation is not None,
     )

@@ -18,4 +18,3 @@ from palpate.unknowns.parameters import ParameterMap as ParameterMap
 from palpate.unknowns.parameters import eta_of_ratio as eta_of_ratio
 from palpate.unknowns.parameters import parameter_map as parameter_map
 from palpate.unknowns.parameters import ratio_of_eta as ratio_of_eta
-from palpate.unknowns.total_variation import TotalVariation as TotalVariation

@@ -22,7 +22,6 @@ from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import Observation
 from palpate.observation.prescribed_motion import PrescribedMotion
 from palpate.observation.wall_modes import Wall
-from palpate.unknowns.total_variation import TotalVariation, total_variation
 
 AMPLITUDES = (0.005, 2.0)  # bounds, times the standard deviation of the coefficients
 STILL, SLIGHT = 0.02, 0.1  # motion of a frame that stands still, and that hardly moves, over that of a moving one
@@ -68,8 +67,7 @@ class Block:
     left_out: variances of the first noise, a tenth of the found one, that what is left out of the unknowns may explain
     (see `informed_objective`); below 0 none is. regions: numbers of the model's regions whose moduli it multiplies, one
     unknown x for all of them, where it acts on moduli: a `share` s of each, in series with the rest of it, is e^x times
-    as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. variation: -ln of the prior where that is not normal;
-    an estimate begins with P then. Raises `ConfigurationError` for terms of another size.
+    as stiff, and the whole 1 / (1 + s (e^-x - 1)) times. Raises `ConfigurationError` for terms of another size.
     """
 
     of: str
@@ -90,7 +88,6 @@ class Block:
     regions: tuple[int, ...] = ()
     share: float = 1.0
     left_out: float = LEFT_OUT
-    variation: TotalVariation | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.precision),) * 2
@@ -119,8 +116,7 @@ class Block:
         covariance = inverse @ np.linalg.inv(self.precision) @ inverse.T
         alternatives = tuple(tuple(inverse @ term @ inverse.T for term in terms) for terms in self.alternatives)
         precision = np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), dtype=np.float64)
-        variation = self.variation and self.variation.combined(np.linalg.inv(self.precision) @ inverse.T @ precision)
-        return replace(self, precision=precision, alternatives=alternatives, variation=variation)
+        return replace(self, precision=precision, alternatives=alternatives)
 
 
 def unit_blocks(*n_modes: int) -> tuple[Block, ...]:
@@ -207,12 +203,10 @@ def material_blocks(
     more likely. A very patchy tissue looks like a frame that moves: where the frame moves none is very patchy, or
     hardly an estimate with such a frame would state anything. The field of a tissue that is mapped has the amplitude
     that is stated until twice of it is clearly more likely. It has no less: a small part that differs in a tissue that
-    is else homogeneous speaks for a small amplitude, which hides it. Where its prior is the total variation nothing is
-    chosen.
+    is else homogeneous speaks for a small amplitude, which hides it.
     """
-    blocks, tissues, end = [], mesh.tissues, 0
+    blocks, tissues = [], mesh.tissues
     for tissue, n in modes.sizes:
-        start, end = end, end + n
         if not n:
             continue
         cause, sd, shares = "heterogeneity", heterogeneity_sd, PATCHINESS
@@ -220,7 +214,6 @@ def material_blocks(
             cause, sd, shares = FIELD, mapped.sd, FIELD_AMPLITUDES
         first, *_ = levels = [(share * sd) ** 2 for share in shares]
         odds = (0.0,) * len(levels) if mapped else PATCHY_ODDS
-        edges = mapped if mapped and mapped.total_variation else None
         blocks.append(
             Block(
                 tissues[tissue].name,
@@ -228,13 +221,12 @@ def material_blocks(
                 Acts.MATERIAL,
                 states,
                 np.eye(n) / first,
-                () if edges else tuple((level * np.eye(n),) for level in levels),
+                tuple((level * np.eye(n),) for level in levels),
                 amplitudes=(1.0, 1.0),
-                odds=() if edges else odds,
+                odds=odds,
                 last=mapped is None,
                 rivals=() if mapped else (FRAME,),
                 left_out=LEFT_OUT if mapped is None else LEFT_OUT_OF_MAP,
-                variation=total_variation(mesh, modes.fields[:, start:end], edges) if edges else None,
             )
         )
     if modes.poisson:
