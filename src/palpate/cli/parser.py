@@ -56,7 +56,7 @@ EXAMPLES = {
     "report": ("palpate report out", "palpate report out --json"),
     "sensitivity": (
         "palpate sensitivity case/case.toml --output out",
-        "palpate sensitivity case/case.toml --sobol 64 --output out",
+        "palpate sensitivity out/case.toml --set mechanics.law=linear --output linear",
     ),
     "cohort": (
         "palpate cohort cohort.csv --template case.toml --output study",
@@ -205,8 +205,6 @@ def _add_estimates(subparsers: Any) -> None:
     what = "estimate a case, then again under changed assumptions; an interrupted run continues"
     sensitivity = _command(subparsers, "sensitivity", written.sensitivity, what=what)
     _add_case(sensitivity)
-    what = "also compute Sobol indices from N samples of each input, a power of 2 (extra `sensitivity`)"
-    sensitivity.add_argument("--sobol", type=_power_of_two, default=0, metavar="N", help=what)
     sensitivity.set_defaults(targets=written.SENSITIVITY_TARGETS)
     what = "write report.html of an estimate again"
     report = _command(subparsers, "report", written.report, what=what, folder=None)
@@ -323,12 +321,6 @@ def _command(
     command.add_argument("--quiet", action="store_true", help="no progress, no table")
     command.add_argument("--verbose", action="store_true", help="also print the details of the computation")
     return command
-
-
-def _power_of_two(text: str) -> int:
-    if text not in (powers := [str(2**n) for n in range(3, 17)]):
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no power of 2 from {powers[0]} to {powers[-1]}")
-    return int(text)
 
 
 def _samples(text: str) -> str:

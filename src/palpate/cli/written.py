@@ -65,7 +65,7 @@ def demo(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: Pro
     return _write_estimate(run_demo(outputs.path, progress), outputs, progress)
 
 
-def sensitivity(arguments: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Progress) -> Outcome:
+def sensitivity(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Progress) -> Outcome:
     """How each modulus depends on what it rests on, the largest effect first."""
     from palpate.report.tornado import sensitivity_table
     from palpate.steps.saving import save_sensitivity
@@ -74,7 +74,7 @@ def sensitivity(arguments: argparse.Namespace, case: Case, outputs: OutputFolder
     from palpate.study.sensitivity import sensitivity as vary
 
     refuse_other_result(case, outputs.path)
-    found = vary(case, kept=Kept(outputs), sobol=arguments.sobol, progress=progress)
+    found = vary(case, kept=Kept(outputs), progress=progress)
     document = save_sensitivity(found, outputs)
     text = f"{columns(sensitivity_table(document))}\n{warning_lines(document)}{listed(outputs)}"
     return Outcome(document, text)

@@ -191,13 +191,7 @@ def sensitivity_page(document: Mapping[str, Any]) -> str:
     tissues, unit = [], shown_unit(document)
     for place, item in enumerate(document["estimates"]):
         value, interval = unit.numbers(item)
-        tissue, sobol = item["tissue"], document["sobol"]
-        indices = []  # name of each input with its first and total index, the largest total first
-        if sobol is not None:
-            parts = [sobol[key][tissue] for key in ("total", "total_half", "first", "first_half")]
-            named = zip([NAMES[of["cause"]].format(of["subject"]) for of in sobol["inputs"]], *parts, strict=True)
-            ranked = sorted(named, key=lambda row: -row[1])
-            indices = [(name, f"{a:.3f} ± {ah:.3f}", f"{b:.3f} ± {bh:.3f}") for name, b, bh, a, ah in ranked]
+        tissue = item["tissue"]
         tissues.append(
             {
                 "name": tissue,
@@ -206,7 +200,6 @@ def sensitivity_page(document: Mapping[str, Any]) -> str:
                 "interval": interval_text(interval),
                 "chart": Markup(tornado_svg(document, tissue, name=f"tornado{place}")),  # noqa: S704 - ours
                 "rows": [(row, effect_text(row)) for row in tornado_rows(document, tissue)],
-                "sobol": indices,
             }
         )
     return str(template_of("sensitivity.html").render(document=document, tissues=tissues, unit=unit))

@@ -178,22 +178,19 @@ def simulate(case: Case, *, steps: int = 1, progress: Wanted = "auto") -> Simula
         return simulated(case, steps=steps, progress=tell)
 
 
-def sensitivity(
-    case: Case, *, sobol: int = 0, output: PathLike | None = None, progress: Wanted = "auto"
-) -> Sensitivity:
+def sensitivity(case: Case, *, output: PathLike | None = None, progress: Wanted = "auto") -> Sensitivity:
     """Each modulus of a case under changed assumptions: constants, segmentation, law, boundary, mesh, alignment, prior.
 
-    sobol: samples an input of the Sobol indices, a power of 2 (extra `sensitivity`); 0: none. output: a folder for
-    sensitivity.json and sensitivity.html, where an interrupted study goes on; None: nothing is written. Raises as
-    `estimate` does, `NotConverged` where the case itself has no estimate, and `ConfigurationError` where the folder
-    holds the result of another case.
+    output: a folder for sensitivity.json and sensitivity.html, where an interrupted study goes on; None: nothing is
+    written. Raises as `estimate` does, `NotConverged` where the case itself has no estimate, and `ConfigurationError`
+    where the folder holds the result of another case.
     """
     if output is None:
         with shown_in_python(progress) as tell:
-            return vary(case, sobol=sobol, progress=tell)
+            return vary(case, progress=tell)
     outputs = OutputFolder(Path(output))
     with held_folder(outputs.path), shown_in_python(progress) as tell:
         refuse_other_result(case, outputs.path)
-        found = vary(case, kept=Kept(outputs), sobol=sobol, progress=tell)
+        found = vary(case, kept=Kept(outputs), progress=tell)
         save_sensitivity(found, outputs)
     return found

@@ -30,7 +30,7 @@ from palpate.images.tissue import Role
 from palpate.inversion import Inversion, InversionSettings, StopRule
 from palpate.mechanics.dilatation import choose_element
 from palpate.parallel import blas_on_one_thread
-from palpate.progress import Line, Progress, counted, details, silent
+from palpate.progress import Line, Progress, details, silent
 from palpate.study.body import Body, joint_problem, make_body
 from palpate.study.case import Case
 from palpate.study.case_body import LAW_NAMES
@@ -43,8 +43,7 @@ from palpate.study.provenance import software_versions
 from palpate.study.read import CaseImages, read_case_images
 from palpate.study.result import Provenance, closing, json_object
 from palpate.study.run import inversion_settings, observed_of
-from palpate.study.variations import SobolResult, Variation, fast_variations, sobol_result, voxel_mm
-from palpate.uncertainty import require_salib
+from palpate.study.variations import Variation, fast_variations, voxel_mm
 
 KEPT = "variants"  # folder of the finished parts
 COARSER = 1.25  # times the mesh's edge length
@@ -84,14 +83,13 @@ class Kept:
 class Sensitivity:
     """Every modulus under every changed assumption.
 
-    estimates: of the case as it is, an entry a tissue as in result.json; sobol: None where it was not asked for.
+    estimates: of the case as it is, an entry a tissue as in result.json.
     """
 
     case: Case
     estimates: tuple[Mapping[str, Any], ...]
     variations: tuple[Variation, ...]
     provenance: Provenance
-    sobol: SobolResult | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """The document sensitivity.json, schema palpate.sensitivity/1, ready for strict JSON."""
@@ -102,7 +100,6 @@ class Sensitivity:
             "element": self.case.mechanics.element,
             "estimates": [dict(item) for item in self.estimates],
             "variations": [asdict(variation) for variation in self.variations],
-            "sobol": None if self.sobol is None else asdict(self.sobol),
         }
         return json_object(document | closing(self.case, self.provenance, ()))
 
@@ -119,13 +116,12 @@ class Variant:
 
 
 @blas_on_one_thread()
-def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progress: Progress = silent) -> Sensitivity:
+def sensitivity(case: Case, *, kept: Kept | None = None, progress: Progress = silent) -> Sensitivity:
     """Estimate a case, and say how each modulus depends on what it rests on.
 
-    kept: finished parts of an earlier study are taken from there, new ones left there; sobol: samples an input of the
-    Sobol indices, a power of 2; none with 0. A variant without an estimate says why. Raises as `estimate` does,
-    `ConfigurationError` for a case that seeks Poisson's ratios, which are varied here, `NotConverged` where the case
-    itself has no estimate, `ResourceError` where `sobol` asks for SALib and it is not installed.
+    kept: finished parts of an earlier study are taken from there, new ones left there. A variant without an estimate
+    says why. Raises as `estimate` does, `ConfigurationError` for a case that seeks Poisson's ratios, which are varied
+    here, `NotConverged` where the case itself has no estimate.
     """
     began, kept = time.perf_counter(), kept or Kept()
     if case.estimate.seeks_poisson_ratios:
@@ -133,16 +129,14 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
             "a sensitivity study varies Poisson's ratios, but this case estimates them:"
             ' leave [estimate] parameters at ["youngs_modulus"]'
         )
-    if sobol:
-        require_salib()
     progress(Line("reading the images"))
     images = read_case_images(case, progress=progress)
     key = kept_under(case, images.inputs)
     bodies = cache(lambda: _meshed(images, case, details(progress)))
-    base = kept.get(f"estimate-sobol-{sobol}", key)
+    base = kept.get("estimate", key)
     if base is None:
-        base = json_object(_estimated(case, bodies(), sobol, progress))
-        kept.put(f"estimate-sobol-{sobol}", key, base)
+        base = json_object(_estimated(case, bodies(), progress))
+        kept.put("estimate", key, base)
     variations = [Variation(**each) for each in base["variations"]]
     first = images.pairs[0]
     edge_mm = edge_length_of(case, first.before, first.after).mm
@@ -160,13 +154,11 @@ def sensitivity(case: Case, *, kept: Kept | None = None, sobol: int = 0, progres
         varied.append(Variation(**{name: value for name, value in part.items() if name != "key"}))
     variations += _against(*varied)
     seconds = {"total": round(time.perf_counter() - began, 3)}
-    indices = base["sobol"]
     return Sensitivity(
         case,
         tuple(base["estimates"]),
         tuple(variations),
         Provenance(seconds, images.inputs, software_versions()),
-        None if indices is None else SobolResult(**indices),
     )
 
 
@@ -207,7 +199,7 @@ def _inverted(
     return inverted(bodies, problem, case, settings, progress=progress), settings
 
 
-def _estimated(case: Case, bodies: Bodies, sobol: int, progress: Progress) -> dict[str, Any]:
+def _estimated(case: Case, bodies: Bodies, progress: Progress) -> dict[str, Any]:
     """The case as it is, and all that is found on the fast path around it."""
     progress(Line("estimating the case as it is"))
     inversion, settings = _inverted(bodies, case, details(progress))
@@ -219,22 +211,13 @@ def _estimated(case: Case, bodies: Bodies, sobol: int, progress: Progress) -> di
     later = tuple(image for body in bodies for image in body.states.after)
     observed = observed_of(inversion, bodies)
     estimation = conclude(inversion, settings, observed, truth={}, seed=case.seed, progress=details(progress))
-    given: dict[str, Any] = {
-        "dilatation": choose_element(case.mechanics.element).dilatation,
-        "voxel_mm": voxel_mm(later),
-    }
-    tissues = bodies[0].space.mesh.tissues
+    tissues, dilatation = bodies[0].space.mesh.tissues, choose_element(case.mechanics.element).dilatation
     progress(Line("changing constants, surfaces, modes and priors, one after the other"))
-    variations = fast_variations(inversion, settings, tissues, **given)
-    indices = None
-    if sobol:
-        progress(Line(f"Sobol indices: {counted(sobol, 'sample')} of each input"))
-        indices = asdict(sobol_result(inversion, settings, tissues, n=sobol, seed=case.seed, **given))
+    variations = fast_variations(inversion, settings, tissues, dilatation=dilatation, voxel_mm=voxel_mm(later))
     return {
         "estimates": [{name: getattr(item, name) for name in BASE} for item in estimation.estimates],
         "theta": inversion.minimum.unknowns[: inversion.objective.n_parameters],
         "variations": [asdict(variation) for variation in variations],
-        "sobol": indices,
     }
 
 

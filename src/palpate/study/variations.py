@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.errors import EstimationError, SolverError
 from palpate.images.segmentation import Segmentation
@@ -26,7 +25,6 @@ from palpate.uncertainty import (
     law_errors,
     modulus_errors,
     poisson_errors,
-    sobol_indices,
     surface_errors,
 )
 
@@ -80,41 +78,11 @@ def ratio_change(change: float, cause: str, subject: str, setting: str, *, relat
 
 
 @dataclass(frozen=True, slots=True)
-class Range:
-    """An input of the Sobol indices: uniform between low and high, in `unit`."""
-
-    cause: str
-    subject: str
-    low: float
-    high: float
-    unit: str
-
-
-@dataclass(frozen=True, slots=True)
-class SobolResult:
-    """Shares of the variance of ln E of each tissue by each of the `inputs`, in their order.
-
-    sd: standard deviation of ln E over all inputs; first, total with the half widths of their 95 % intervals; failed:
-    share of the samples without an estimate, which count as the base estimate.
-    """
-
-    samples: int
-    inputs: tuple[Range, ...]
-    sd: Mapping[str, float]
-    first: Mapping[str, tuple[float, ...]]
-    first_half: Mapping[str, tuple[float, ...]]
-    total: Mapping[str, tuple[float, ...]]
-    total_half: Mapping[str, tuple[float, ...]]
-    failed: float
-
-
-@dataclass(frozen=True, slots=True)
 class _Input:
     """One input that can be changed by an amount, with the residuals' changes for a unit of it."""
 
     cause: str
     subject: str
-    unit: str
     errors: Errors
     amounts: tuple[tuple[float, str], ...]
 
@@ -207,66 +175,6 @@ def what_would_change(
     return (*_exact(inversion, tissues), *mapped(lambda change: _stated(names, *change), changes))
 
 
-def sobol_result(
-    inversion: Inversion,
-    settings: InversionSettings,
-    tissues: tuple[Tissue, ...],
-    *,
-    dilatation: Dilatation,
-    voxel_mm: float,
-    n: int,
-    seed: int,
-) -> SobolResult:
-    """Sobol indices of ln E over the ranges of the fast variations, all changed at once; n: a power of 2.
-
-    Raises `ResourceError` where SALib is not installed.
-    """
-    path = fast_path(inversion.objective, inversion.minimum, settings.bounds)
-    mapping = inversion.objective.parameters
-    of = _inputs(inversion, _equilibria(inversion), tissues, dilatation, voxel_mm)
-    inputs = [each for each in of if each.subject != ALL]
-    ranges = [Range(i.cause, i.subject, min(i.amounts)[0], max(i.amounts)[0], i.unit) for i in inputs]
-    # inputs that change no residual: a known modulus that alone sets the scale, and the drivers' prior
-    if _exact(inversion, tissues):
-        (known,) = {tissue.name for tissue in tissues if tissue.role is Role.KNOWN}
-        scale = float(np.log(KNOWN_FACTOR))
-        ranges.append(Range("known_modulus", known, -scale, scale, "ln E"))
-    if mapping.n_coefficients:
-        low, high = np.log2(PRIOR_WIDTHS).tolist()
-        ranges.append(Range("driver_prior", "", low, high, "log2 of the width"))
-    causes = [each.cause for each in ranges[len(inputs) :]]
-
-    def one(sample: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The change of ln E (n_parameters,) of one sample (n_inputs,); NaN where there is no estimate."""
-        weighted = [tuple(x * e for e in each.errors) for x, each in zip(sample, inputs, strict=False)]
-        errors = tuple(np.sum(of, axis=0) for of in zip(*weighted, strict=True))
-        others = dict(zip(causes, sample[len(inputs) :].tolist(), strict=True))
-        try:
-            theta = path.shift(errors, width=2.0 ** others.get("driver_prior", 0.0)).theta
-        except (SolverError, EstimationError):
-            return np.full(mapping.n_parameters, np.nan)
-        return np.asarray(theta + others.get("known_modulus", 0.0))
-
-    found = sobol_indices(
-        lambda samples: np.stack(mapped(one, samples)), [(r.low, r.high) for r in ranges], n=n, seed=seed
-    )
-
-    def by_tissue(shares: NDArray[np.float64]) -> dict[str, tuple[float, ...]]:
-        """Columns of (n_inputs, n_parameters) by tissue."""
-        return {name: tuple(column.tolist()) for name, column in zip(mapping.tissues, shares.T, strict=True)}
-
-    return SobolResult(
-        n * (len(ranges) + 2),
-        tuple(ranges),
-        dict(zip(mapping.tissues, np.sqrt(found.variance).tolist(), strict=True)),
-        by_tissue(found.first),
-        by_tissue(found.first_half),
-        by_tissue(found.total),
-        by_tissue(found.total_half),
-        found.failed,
-    )
-
-
 def _equilibria(inversion: Inversion) -> Equilibria:
     return exact_equilibria(inversion.objective, inversion.minimum.unknowns)
 
@@ -287,21 +195,21 @@ def _inputs(
     for name, own in numbers.items():  # layers round organs are regions of their tissue
         given = regions[own[0]].poisson_ratio
         words = tuple((step, f"{given + step:.3g}") for step in _poisson_steps(given))
-        found.append(_Input("poisson_ratio", name, "", tuple(e[:, own].sum(axis=1) for e in by_poisson), words))
+        found.append(_Input("poisson_ratio", name, tuple(e[:, own].sum(axis=1) for e in by_poisson), words))
     if len(numbers) > 1:
         steps = _poisson_steps(max(tissue.poisson_ratio for tissue in regions))
         words = tuple((step, f"{step:+.3g}") for step in steps)
-        found.append(_Input("poisson_ratio", ALL, "", tuple(e.sum(axis=1) for e in by_poisson), words))
+        found.append(_Input("poisson_ratio", ALL, tuple(e.sum(axis=1) for e in by_poisson), words))
     surfaces = dict.fromkeys(o.name for o in objective.observations if isinstance(o, Imaged))
     for name in (name for name in surfaces if name not in _offset(inversion)):
         amounts = tuple((voxel_mm * share, f"{share:+g} voxel") for share in VOXELS)
-        found.append(_Input("segmentation", name, "mm", surface_errors(minimum.evaluation, name), amounts))
+        found.append(_Input("segmentation", name, surface_errors(minimum.evaluation, name), amounts))
     if not _exact(inversion, tissues):
         by_modulus = modulus_errors(objective, minimum.unknowns, minimum.evaluation)
         step = float(np.log(KNOWN_FACTOR))
         amounts = ((-step, DOWN), (step, UP))
         found += [
-            _Input("known_modulus", name, "ln E", tuple(e[:, own].sum(axis=1) for e in by_modulus), amounts)
+            _Input("known_modulus", name, tuple(e[:, own].sum(axis=1) for e in by_modulus), amounts)
             for name, own in numbers.items()
             if regions[own[0]].role is Role.KNOWN
         ]
