@@ -92,7 +92,7 @@ docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # requirements.lock, which pins what the Dockerfile installs: the libraries, some extras, and what builds the wheel.
-LOCKED := dicom mesh itk dataframe samples sensitivity cohort
+LOCKED := dicom mesh itk dataframe samples cohort
 lock: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "uv>=0.5"
 	echo hatchling | $(BIN)/uv pip compile pyproject.toml - --quiet --upgrade --universal --python-version 3.11 \

@@ -87,10 +87,11 @@ def test_what_data_say_of_a_block_is_the_same_image_by_image():
 
 def test_a_prior_mean_is_not_dropped_where_an_image_follows():
     (parameters, evaluation, x), _ = problem(((0,), (1,))), None
-    mean = np.linspace(-1.0, 1.0, parameters.n_coefficients)
-    shifted = replace(parameters, nuisance_mean=mean)
-    pull = evaluation.prior @ (x - shifted.prior_centre)
-    there = replace(evaluation, score=evaluation.score - evaluation.prior_score + pull, prior_score=pull)
+    shifted = parameters.with_prior(np.array([0.7]), np.array([0.1]))
+    prior = shifted.prior_matrix
+    pull, matrix = prior @ (x - shifted.prior_centre), evaluation.matrix - evaluation.prior + prior
+    score = evaluation.score - evaluation.prior_score + pull
+    there = replace(evaluation, score=score, matrix=matrix, prior=prior, prior_score=pull)
     model = normal_model(shifted, there, x)
     best = solve_by_image(model.data + model.prior, model.pull[:, None], parameters.images)[:, 0]
     assert best == pytest.approx(x - np.linalg.solve(there.matrix, there.score), rel=1e-8)

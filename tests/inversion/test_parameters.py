@@ -219,15 +219,6 @@ def test_a_drivers_prior_of_another_size_is_refused_and_not_replaced(shape):
         replace(mapping_of(3), nuisance_precision=np.ones(shape))
 
 
-def test_the_means_of_blocks_are_those_of_the_prior_and_one_each():
-    means = np.array([0.1, -0.2, 0.3])
-    mapping = replace(mapping_of(3), nuisance_mean=means)
-    assert mapping.prior_centre[mapping.n_parameters :].tolist() == means.tolist()
-    assert mapping.alone(0)[0].prior_centre.tolist() == mapping.prior_centre.tolist()
-    with pytest.raises(ConfigurationError, match="nuisance_mean"):
-        replace(mapping, nuisance_mean=means[:2])
-
-
 def test_a_prior_of_another_number_of_moduli_is_refused():
     with pytest.raises(ConfigurationError, match="prior_mean"):
         mapping_of(3).with_prior(np.zeros(3), np.ones(3))

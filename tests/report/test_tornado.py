@@ -44,7 +44,6 @@ def document(*, verdict="identified", known=10.0, discrepancy=None, boundary="mo
             | {"at_bound": []}
             for c, of, w, by in changes
         ],
-        "sobol": None,
         "case": {
             "tissues": {"fat": {"role": "known", "youngs_modulus_kpa": known}},
             "discrepancy": {"poisson_sd": 0.02, "surface_offset_mm": 0.5} if discrepancy is None else discrepancy,

@@ -20,7 +20,7 @@ class Study:
         self.estimates = estimates
 
     def to_dict(self):
-        keys = {"id": "a", "law": "linear", "element": "P2", "versions": {}, "sobol": None, "case": {}}
+        keys = {"id": "a", "law": "linear", "element": "P2", "versions": {}, "case": {}}
         of_law = {"cause": "law", "subject": "", "setting": "linear", "method": "exact", "at_bound": [], "reason": None}
         variations = [of_law | {"changes": {item["tissue"]: 0.1 for item in self.estimates}}]
         return keys | {"estimates": self.estimates, "variations": variations, "warnings": []}

@@ -134,6 +134,7 @@ BAD = {
     "mesh.edge_lenght_mm=3": "did you mean 'edge_length_mm'",
     "imagse.before='x'": "did you mean 'images'",
     "tissues.prostate.rol='known'": r"\[tissues.prostate\]: did you mean 'role'",
+    "tissues.prostate.field_prior='gaussian'": r"'field_prior' in .*; correct the key, or remove it",
     "tissues.prostate.role=estimat": "did you mean 'estimate'",
     "tissues.prostate.poisson_ratio=0.5": "-1 < nu < 0.5",
     "tissues.prostate.poisson_ratio=-1.0": "-1 < nu < 0.5",

@@ -26,7 +26,7 @@ from palpate.study.inverted import inverted
 from palpate.study.json_schema import SCHEMAS
 from palpate.study.read import read_states
 from palpate.study.run import inversion_settings
-from palpate.study.variations import fast_variations, sobol_result
+from palpate.study.variations import fast_variations
 
 CASE = """
 [images]
@@ -109,15 +109,15 @@ def interrupted(case_file, tmp_path_factory):
         patch.setattr(study, "variants_of", lambda *_: iter(few))
         patch.setattr(inverted_module, "invert", again)
         with pytest.raises(KeyboardInterrupt):
-            palpate.sensitivity(case, sobol=8, output=folder)
+            palpate.sensitivity(case, output=folder)
         before = len(calls)
         assert calls[0] == (len(case.estimate.start_ratios), {"rule": REPORTED}), (
             "the case itself, from every start to full accuracy"
         )
         assert calls[1:] == [(1, {"rule": study.VARIED})] * (before - 1)
-        found = palpate.sensitivity(case, sobol=8, output=folder, progress=told.append)
+        found = palpate.sensitivity(case, output=folder, progress=told.append)
         assert len(calls) == before + 1, "what was finished is not computed again"
-        assert main(["sensitivity", str(case_file), "--sobol", "8", "--output", str(folder), "--quiet"]) == 0
+        assert main(["sensitivity", str(case_file), "--output", str(folder), "--quiet"]) == 0
         assert len(calls) == before + 1
     return folder, found.to_dict(), told
 
@@ -140,7 +140,7 @@ def test_a_study_goes_on_where_it_was_interrupted(interrupted):
     assert sorted(path.name.rsplit("-", 1)[0] for path in (folder / "variants").iterdir()) == [
         "as-it-is",
         "edge-length",
-        "estimate-sobol-8",
+        "estimate",
         "law-neo-hookean",
         "outer-boundary-sliding",
     ]
@@ -180,7 +180,6 @@ def test_the_document_meets_its_schema(document):
     (own,) = (schema for schema in schemas if schema["$id"] == "sensitivity.schema.json")
     validator = jsonschema.Draft202012Validator(own, registry=registry)
     assert [error.message for error in validator.iter_errors(document)] == []
-    assert list(validator.iter_errors(document | {"sobol": {}}))
     assert list(validator.iter_errors(document | {"news": 1}))
 
 
@@ -216,28 +215,12 @@ def test_a_surface_whose_drawing_is_an_unknown_is_not_moved_beside_it(case_file)
     drawn = [row for row in rows if row.cause == "segmentation" and row.subject in sought]
     assert {row.subject for row in drawn} == sought
     assert all(row.changes is None and "interval includes it" in row.reason for row in drawn)
-    indices = sobol_result(inversion, settings, tissues, dilatation=linear, voxel_mm=1.0, n=2, seed=0)
-    assert not sought & {of.subject for of in indices.inputs if of.cause == "segmentation"}
 
 
 def test_what_has_no_estimate_says_why(document):
     lost = row_of(document, "law", setting="neo-hookean")
     assert lost["changes"] is None
     assert lost["reason"] == "no equilibrium"
-
-
-def test_sobol_indices_say_what_the_ranges_say(document):
-    """The effects are nearly linear: the inputs alone account for the variance, as the square of half their range."""
-    sobol = document["sobol"]
-    first = dict(zip([(i["cause"], i["subject"]) for i in sobol["inputs"]], sobol["total"][GLAND], strict=True))
-    assert sobol["samples"] == 8 * (len(first) + 2)
-    assert ("poisson_ratio", "all tissues") not in first
-    widest = max(first, key=first.get)
-    spans = {
-        key: np.ptp([v["changes"][GLAND] for v in document["variations"] if (v["cause"], v["subject"]) == key])
-        for key in first
-    }
-    assert widest == max(spans, key=spans.get)
 
 
 def test_variants_begin_with_the_cheap_ones_and_leave_out_what_the_case_says(case_file):
@@ -271,8 +254,6 @@ def test_the_page_is_whole_escaped_and_without_scripts(document):
     assert GLAND not in page
     assert "<script" not in page
     assert page.count("<svg") == 1
-    assert "Sobol indices" in page
-    assert "Sobol indices" not in sensitivity_page(document | {"sobol": None})
 
 
 def test_a_runaway_ends_in_an_arrow_and_says_so(document):
@@ -284,10 +265,3 @@ def test_a_runaway_ends_in_an_arrow_and_says_so(document):
     assert rows[0].label == "edge length of the mesh"
     assert effect_text(rows[0]) == "8.75 mm: -99.9 % (at the search's bound)"
     assert "<svg" in sensitivity_page(document | {"variations": changed})
-
-
-@pytest.mark.parametrize("number", ["0", "7", "12", "131072", "x"])
-def test_samples_are_a_power_of_two(number):
-    with pytest.raises(SystemExit) as stop:
-        main(["sensitivity", "case.toml", "--sobol", number])
-    assert stop.value.code == 2

@@ -27,7 +27,6 @@ from palpate.uncertainty import (
     law_errors,
     modulus_errors,
     poisson_errors,
-    sobol_indices,
     surface_errors,
 )
 
@@ -203,29 +202,6 @@ def test_modes_that_are_dropped_are_as_if_they_had_never_been(twins, found, path
     )
     assert foretold == pytest.approx((again.least.unknowns - path.least.unknowns)[:2], abs=1e-3)
     assert np.abs(foretold).max() > 1e-3
-
-
-def test_sobol_indices_of_ishigamis_function_are_the_known_ones():
-    """Ishigami & Homma 1990: sin x + 7 sin^2 y + 0.1 z^4 sin x on [-pi, pi]^3."""
-
-    def ishigami(x):
-        return (np.sin(x[:, 0]) + 7.0 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0]))[:, None]
-
-    found = sobol_indices(ishigami, [(-np.pi, np.pi)] * 3, n=4096, seed=1)
-    assert found.first[:, 0] == pytest.approx([0.3139, 0.4424, 0.0], abs=0.02)
-    assert found.total[:, 0] == pytest.approx([0.5576, 0.4424, 0.2437], abs=0.02)
-    assert found.variance[0] == pytest.approx(13.845, rel=0.02)
-    assert found.failed == 0.0
-
-
-def test_samples_without_an_output_count_as_nought_and_are_told():
-    def half(x):
-        return np.where(x[:, :1] > 0.0, 1.0, np.nan)
-
-    found = sobol_indices(half, [(-1.0, 1.0)] * 2, n=256, seed=1)
-    assert found.failed == pytest.approx(0.5, abs=0.01)
-    assert found.variance[0] == pytest.approx(0.25, abs=0.01)
-    assert found.first[0, 0] == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_refit_that_never_settles_is_no_estimate(found, path):

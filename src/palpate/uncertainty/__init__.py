@@ -46,9 +46,6 @@ from palpate.uncertainty.sensitivity import law_errors as law_errors
 from palpate.uncertainty.sensitivity import modulus_errors as modulus_errors
 from palpate.uncertainty.sensitivity import poisson_errors as poisson_errors
 from palpate.uncertainty.sensitivity import surface_errors as surface_errors
-from palpate.uncertainty.sobol import SobolIndices as SobolIndices
-from palpate.uncertainty.sobol import require_salib as require_salib
-from palpate.uncertainty.sobol import sobol_indices as sobol_indices
 from palpate.uncertainty.stiffness_map import CONTRAST as CONTRAST
 from palpate.uncertainty.stiffness_map import DifferentRegion as DifferentRegion
 from palpate.uncertainty.stiffness_map import StiffnessMap as StiffnessMap

@@ -111,9 +111,8 @@ class ParameterMap:
     state takes its `coefficients`: of its boundary modes, then of its material modes, in the order of the blocks.
 
     The prior is normal: theta with `prior_mean` (n_parameters,) and `prior_precision` (n_parameters, n_parameters),
-    flat by default, the blocks' unknowns with `nuisance_mean` (n_coefficients,), by default 0, and `nuisance_precision`
-    (n_coefficients, n_coefficients), by default what the blocks believe. Raises `ConfigurationError` for a prior of
-    another shape.
+    flat by default, the blocks' unknowns with the mean 0 and `nuisance_precision` (n_coefficients, n_coefficients), by
+    default what the blocks believe. Raises `ConfigurationError` for a prior of another shape.
     """
 
     base: NDArray[np.float64]
@@ -125,7 +124,6 @@ class ParameterMap:
     prior_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     prior_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     nuisance_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
-    nuisance_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     poisson: tuple[OpenPoisson, ...] = ()
     _layout: _Layout = field(init=False, repr=False, compare=False)
 
@@ -146,12 +144,6 @@ class ParameterMap:
                     f"{name} has the shape {given.shape}; {n} parameters and {self.n_coefficients} unknowns in blocks"
                     f" need {default.shape}"
                 )
-
-        if self.nuisance_mean.size not in (0, self.n_coefficients):
-            raise ConfigurationError(
-                f"nuisance_mean has the shape {self.nuisance_mean.shape}; {self.n_coefficients} unknowns in blocks need"
-                " one each, or none where all means are 0"
-            )
 
     @property
     def by_load(self) -> bool:
@@ -223,8 +215,7 @@ class ParameterMap:
     @property
     def prior_centre(self) -> NDArray[np.float64]:
         """Mean (n_unknowns,) of all unknowns before the images are seen."""
-        of_blocks = self.nuisance_mean if self.nuisance_mean.size else np.zeros(self.n_coefficients)
-        return np.concatenate([self.prior_mean, of_blocks])
+        return np.concatenate([self.prior_mean, np.zeros(self.n_coefficients)])
 
     def moduli(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """The regions' moduli (n_regions,) kPa at unknowns (n_unknowns,), or at theta (n_parameters,) alone.
@@ -307,8 +298,7 @@ class ParameterMap:
         own = np.concatenate([np.arange(self.n_parameters), *(self.columns(i) for i in kept)])
         nuisance = own[self.n_parameters :] - self.n_parameters
         precision = self.nuisance_precision[np.ix_(nuisance, nuisance)]
-        mean = self.nuisance_mean[nuisance] if self.nuisance_mean.size else self.nuisance_mean
-        return replace(self, blocks=blocks, nuisance_precision=precision, nuisance_mean=mean), own
+        return replace(self, blocks=blocks, nuisance_precision=precision), own
 
     def _model_columns(self, state: int) -> NDArray[np.int64]:
         return np.concatenate([self.acting(Acts.BOUNDARY, state), self.acting(Acts.MATERIAL, state)])
