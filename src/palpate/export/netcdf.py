@@ -31,7 +31,7 @@ class Samples:
 
     tissues: tuple[str, ...]
     moduli: NDArray[np.float64]
-    log_density: NDArray[np.float64]
+    log_density: NDArray[np.float64] | None
     kind: str
 
 
@@ -42,10 +42,10 @@ def moduli_samples(model: FittedModel) -> Samples:
     """
     if model.samples is not None:
         found = model.samples
-        return Samples(found.tissues, found.moduli, found.log_density, SAMPLED)
+        return Samples(found.tissues, found.moduli[None], None, SAMPLED)
     centre = np.log([item.value if model.unit == "kPa" else item.ratio for item in model.estimates])  # type: ignore
     n = len(centre)
-    normal = np.random.default_rng(SEED).standard_normal((CHAINS, DRAWS, n))
+    normal = np.random.default_rng(SEED).standard_normal((1, DRAWS, n))
     values, vectors = np.linalg.eigh(model.covariance)
     spread = np.sqrt(np.maximum(values, 0.0))
     logarithms = centre + (normal * spread) @ vectors.T
@@ -84,17 +84,14 @@ def write_posterior(model: FittedModel, path: Path) -> None:
                 group.create_variable(axis, (axis,), data=np.arange(count))
         moduli = file["posterior"].create_variable("youngs_modulus", ("chain", "draw", "tissue"), data=samples.moduli)
         moduli.attrs["units"], moduli.attrs["kind"] = unit, samples.kind
-        file["sample_stats"].create_variable("lp", ("chain", "draw"), data=samples.log_density)
-        if model.samples is not None:
-            accepted = model.samples.accepted
-            file["sample_stats"].create_variable("acceptance_rate", ("chain",), data=accepted)
+        if samples.log_density is not None:
+            file["sample_stats"].create_variable("lp", ("chain", "draw"), data=samples.log_density)
         given = [item.interval95 if model.unit == "kPa" else item.ratio_interval95 for item in model.estimates]
         ends = np.array([[np.nan if end is None else end for end in pair or (None, None)] for pair in given])
         constants = {"interval95_low": ends[:, 0], "interval95_high": ends[:, 1]}
-        if model.samples is not None:  # their own intervals, and how they mixed
-            own, found = model.samples.interval95, model.samples.diagnostics
+        if model.samples is not None:
+            own = model.samples.interval95
             constants |= {"samples_interval95_low": own[:, 0], "samples_interval95_high": own[:, 1]}
-            constants |= {"r_hat": found.r_hat, "ess_bulk": found.ess_bulk, "ess_tail": found.ess_tail}
         for name, values in constants.items():
             variable = file["constant_data"].create_variable(name, ("tissue",), data=values)
             if "interval95" in name:

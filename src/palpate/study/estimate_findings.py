@@ -44,8 +44,8 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
                 " data: try a smaller mesh.edge_length_mm, another law, or [noise].",
             )
         )
-    alike = Counter(tuple(sorted(of.chosen.items())) for of in inversion.mixture.explanations if of.weight > SEVERAL)
-    if max(alike.values(), default=0) > 1:
+    several = Counter(tuple(sorted(of.chosen.items())) for of in inversion.mixture.explanations if of.weight > SEVERAL)
+    if max(several.values(), default=0) > 1:
         findings.append(
             Finding(
                 "several-minima",

@@ -14,7 +14,6 @@ from palpate.inversion import (
     InversionSettings,
     Iterate,
     Linearisation,
-    Outcome,
     StartRun,
 )
 from palpate.mesh.voxelise import voxelise

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special
 
-from palpate.inversion import Bounds, Mixture
+from palpate.inversion import Mixture
 from palpate.uncertainty.covariance import Covariance
 from palpate.uncertainty.intervals import Interval
 from palpate.uncertainty.profile import Profile
@@ -113,7 +113,7 @@ class Marginal:
         places, roots = self.profile.theta, np.maximum.accumulate(self.profile.root)
         there = np.atleast_1d(np.asarray(theta, dtype=np.float64))
         if len(places) < 2:
-            return there - self.theta[0]
+            return np.asarray(there - self.theta[0])
         found = self.spread * np.interp(there, places, roots)
         for end, side, inner in ((0, there < places[0], 1), (-1, there > places[-1], -2)):
             steps = places[end] - places[inner]
@@ -122,7 +122,7 @@ class Marginal:
         return np.asarray(found)
 
     def at(self, which: NDArray[np.int64], away: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Ln E (n,) that lie `away` (n,) from the estimates of explanations `which` (n,) in the coordinate; by a table."""
+        """Ln E (n,) at coordinates that lie `away` (n,) from those of explanations `which` (n,); by a table."""
         places = self.coordinate(self.theta)[which] + away
         reach = float(np.abs(away).max(initial=0.0)) / FLAT
         table = np.linspace(float(self.theta.min()) - reach, float(self.theta.max()) + reach, TABLE)

@@ -170,8 +170,8 @@ def wall_blocks(wall: Wall, state: int, *, learned: bool = True) -> tuple[Block,
     n, m = len(wall.columns), wall.n_fine
     terms = [linalg.block_diag(of, np.zeros((m, m))) for of in (*wall.drifts, *wall.swellings)]
     terms += [np.diag(np.repeat([0.0, 1.0], [n, m]))] if m else []
-    own = Block(wall.name, "driver", Acts.BOUNDARY, (state,), only(np.eye(n + m)), terms=tuple(terms) if learned else ())
-    return (own,) if n + m else ()
+    own = wall.name, "driver", Acts.BOUNDARY, (state,), only(np.eye(n + m))
+    return (Block(*own, terms=tuple(terms) if learned else ()),) if n + m else ()
 
 
 def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
