@@ -48,7 +48,7 @@ def methods_text(data: ReportData) -> Methods:
 
     leaning = listed([item["tissue"] for item in moduli_in(data.document) if item.get("interval_kind") == "profile"])
     if leaning:
-        leaning = f"; of {leaning}, whose profile likelihood leans to one side, its ends are those of the profile"
+        leaning = f"; of {leaning}, whose profile likelihood leans to one side, they follow the profile"
     # which unknowns the intervals allow for, and the errors of what is given, which they do not cover
     shares = [share for item in moduli_in(data.document) for share in (item.get("variance_shares") or {}).items()]
     counted = {cause for cause, share in shares if share > 0.0}
@@ -63,16 +63,19 @@ def methods_text(data: ReportData) -> Methods:
         _model(data, cite),
         (
             f"The misfit was {observed}. Outliers counted less: by densities with the tails of a power law, on the"
-            f" drivers' walls by Huber's loss {cite('huber')}. Minus the log posterior of the logarithms of the moduli,"
-            " of all other unknowns, of the noise and of the priors' amplitudes was minimised from"
-            f" {len(data.document['starts'])} starts by Gauss-Newton steps in a trust region {cite('nocedal')}, on a"
-            f" reduced basis whose error was bounded at the estimate {cite('reduced')}."
+            f" drivers' walls by Huber's loss {cite('huber')}. The posterior of the logarithms of the moduli was a mixture"
+            " over what may explain the images: how patchy the tissues are, whether layers lie round organs, whether the"
+            " frame of each image moves, and whether its surfaces are drawn alike. Each explanation counted by its evidence"
+            f" in Laplace's approximation {cite('laplace')}, at its own minimum over all other unknowns. Minima were found"
+            f" by Gauss-Newton steps in a trust region {cite('nocedal')} on reduced models {cite('reduced')}, which were"
+            f" made exact at the posterior's mean. {len(data.document['starts'])} starts looked for other minima."
             f"{onwards if law is not None and law.finite else ''}"
         ),
         (
-            "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated"
-            f" residuals {cite('white')}, with the scatter over the voxel grid's position and a term for the mesh"
-            f" added{leaning}.{covered} The seed of random numbers was {data.document['seed']}."
+            "Values are medians, and 95 % intervals quantiles, of that mixture. They are wider by spatially correlated"
+            f" residuals (sandwich covariance {cite('white')}), the scatter over the voxel grid's position and a term for"
+            " the mesh"
+            f"{leaning}.{covered} The seed of random numbers was {data.document['seed']}."
         ),
     )
     own = SOURCES["palpate"]
