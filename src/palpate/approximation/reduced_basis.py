@@ -30,7 +30,8 @@ ITERATIONS = 3.0, 5.0  # of conjugate gradients: at least, and for each unit of 
 MAKING = 2.5e-5  # seconds an unknown that a factorisation takes beside elimination: its matrix, and its probes
 FAR_OFF = 3e-3  # missing share of the displacement, below which derivatives are wrong by as small a share
 MAX_ITERATIONS = 120
-TOGETHER = 128  # right-hand sides of several states that are solved for together
+FEW = 12  # right-hand sides, of which an iteration takes no less time: the factor is read once
+TOGETHER = 64  # right-hand sides of several states that are solved for together
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,7 +364,7 @@ def _near(found: Sequence[_Missing]) -> tuple[LinearSystem, bool]:
     if isinstance(factorisation, CheckedFactorisation) and SOLVERS[factorisation.solver].direct and spread(near) < far:
         solver = SOLVERS[factorisation.solver]
         unknowns = factorisation.matrix.shape[0]
-        made, once = (solver.expect_of_size(unknowns, n).seconds for n in (0, number))
+        made, once = (solver.expect_of_size(unknowns, n).seconds for n in (0, max(number, FEW)))
         steps = ITERATIONS[0] + ITERATIONS[1] * (np.sqrt(spread(near)) - 1.0)
         if steps * (once - made) < made + MAKING * unknowns:
             return near, False

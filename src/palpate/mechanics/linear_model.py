@@ -126,6 +126,7 @@ class LinearModel:
         # SciPy drops entries that cancel in a sum; an imaginary part keeps them, so that one pattern serves all moduli
         marked = (sparse.csr_matrix((k.data + 1j, k.indices, k.indptr), shape=k.shape) for k in self.free_stiffness)
         matrix = sparse.csr_matrix(weighted_sum(checked, tuple(marked)).real)
+        matrix.data = matrix.data.copy()  # which else are every other number in memory, and keep the others
         return LinearSystem(
             self,
             checked,
