@@ -130,6 +130,12 @@ def test_states_of_one_body_are_made_exact_together_as_each_is_alone(first, twin
     assert all(counts.forward == 1 for counts in spent)
 
 
+def test_however_many_are_sought_nothing_is_factorised_again_where_it_was(first, equal, twin, directions):
+    points = [LinearisationPoint(equal, share * twin.coefficients, directions) for share in np.linspace(-1.0, 1.0, 300)]
+    bases = ReducedBasis.update_all([first] * len(points), points)
+    assert all(basis.factorisation is first.factorisation for basis in bases)
+
+
 def test_an_update_where_it_is_exact_already_solves_no_displacement_again(first, twin, directions):
     once = first.update(LinearisationPoint(twin.moduli, twin.coefficients))
     twice = once.update(LinearisationPoint(twin.moduli, twin.coefficients, directions))

@@ -118,7 +118,7 @@ class ReducedBasis:
 
         Of its parts, too, that follow the material modes.
         """
-        model, displacement = self.full_model, self._homogeneous(at)
+        model, displacement = self.full_model, self.homogeneous(at)
         material = at.coefficients[model.constraint.n_modes :, None]
         if not np.any(material):
             return ModelError(*self.system.error_bound(at.moduli, displacement))
@@ -130,7 +130,7 @@ class ReducedBasis:
         """With the responses (n_dof, n_material) mm to the material modes at moduli (n_regions,) kPa."""
         return replace(self, projection=self.projection.with_material(responses), material_at=moduli)
 
-    def _stale(self, at: LinearisationPoint) -> bool:
+    def stale(self, at: LinearisationPoint) -> bool:
         """Whether responses to the material modes are not there yet, or of far from a place that asks for them all."""
         if not self.full_model.material.n_modes:
             return False
@@ -138,7 +138,7 @@ class ReducedBasis:
             return True
         return at.all_material and bool(np.abs(np.log(at.moduli / self.material_at)).max() > STALE)
 
-    def _homogeneous(self, at: LinearisationPoint) -> NDArray[np.float64]:
+    def homogeneous(self, at: LinearisationPoint) -> NDArray[np.float64]:
         """The displacement (n_dof,) mm at a place as it would be of homogeneous tissues."""
         boundary = self.full_model.constraint.n_modes
         of_boundary = np.where(np.arange(len(at.coefficients)) < boundary, at.coefficients, 0.0)
@@ -153,7 +153,7 @@ class ReducedBasis:
         """
         model, system, regions = self.full_model, self.system, np.flatnonzero(by_theta.any(axis=1))
         n_parameters = by_theta.shape[1]
-        level = self._homogeneous(LinearisationPoint(system.moduli, coefficients))[:, None]
+        level = self.homogeneous(LinearisationPoint(system.moduli, coefficients))[:, None]
         vectors: list[NDArray[np.float64]] = []
         while level.shape[1] * n_parameters + sum(v.shape[1] for v in vectors) <= SERIES:
             by_region = system.modulus_responses(level, regions=regions, tolerance=SNAPSHOT)
@@ -242,9 +242,9 @@ class _Missing:
     @classmethod
     def of(cls, basis: ReducedBasis, at: LinearisationPoint) -> _Missing:
         """What it is of a basis at a place."""
-        every = at.directions is not None and basis._stale(at)  # noqa: SLF001
+        every = at.directions is not None and basis.stale(at)
         along = _Directions.at(at, basis.full_model, every=every)
-        return cls(basis, at, every, along, basis._homogeneous(at), int(not at.same_as(basis.place)))  # noqa: SLF001
+        return cls(basis, at, every, along, basis.homogeneous(at), int(not at.same_as(basis.place)))
 
     @property
     def number(self) -> int:
@@ -358,7 +358,7 @@ def _near(found: Sequence[_Missing]) -> tuple[LinearSystem, bool]:
 
     near = min((of.basis.system for of in found), key=spread)
     factorisation, number = near.factorisation, sum(of.number for of in found)
-    if not number:
+    if not number or np.array_equal(near.moduli, moduli):
         return near, False
     far = FAR if any(of.at.directions is not None for of in found) else FAR_ALONE
     if isinstance(factorisation, CheckedFactorisation) and SOLVERS[factorisation.solver].direct and spread(near) < far:
