@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.approximation import LinearisationPoint, reduced_basis
+from palpate.approximation import LinearisationPoint, ReducedBasis, reduced_basis
 from palpate.approximation.reduced_basis import SERIES
 from palpate.inversion.objective import deciding_directions
 from palpate.observation.noise_model import SEGMENTATION_NOISE
@@ -111,6 +111,29 @@ def test_an_update_factorises_only_where_the_moduli_are_far(first, twin, directi
     there = first.update(far)
     assert there.counts.factorisations == first.counts.factorisations + 1
     assert there.error(far).relative < 1e-6
+
+
+@pytest.mark.parametrize(("stiffer", "made"), [(1.0, 0), (100.0, 1)])
+def test_states_of_one_body_are_made_exact_together_as_each_is_alone(first, twin, directions, stiffer, made):
+    """By one factorisation where the moduli are far."""
+    moduli = twin.moduli * [stiffer, 1.0, 1.0]
+    points = [LinearisationPoint(moduli, share * twin.coefficients, directions) for share in (1.0, -0.5, 0.2)]
+    together = ReducedBasis.update_all([first] * 3, points)
+    for basis, at in zip(together, points, strict=True):
+        here, alone = (of.model.solve(moduli, at.coefficients) for of in (basis, first.update(at)))
+        assert here.values == pytest.approx(alone.values, abs=1e-4 * np.abs(alone.values).max())
+        ways = [there.tangent() @ directions for there in (here, alone)]
+        assert np.linalg.norm(ways[0] - ways[1]) < 1e-3 * np.linalg.norm(ways[1])
+        assert basis.factorisation is together[0].factorisation
+    spent = [basis.counts - first.counts for basis in together]
+    assert sum(counts.factorisations for counts in spent) == made
+    assert all(counts.forward == 1 for counts in spent)
+
+
+def test_however_many_are_sought_nothing_is_factorised_again_where_it_was(first, equal, twin, directions):
+    points = [LinearisationPoint(equal, share * twin.coefficients, directions) for share in np.linspace(-1.0, 1.0, 300)]
+    bases = ReducedBasis.update_all([first] * len(points), points)
+    assert all(basis.factorisation is first.factorisation for basis in bases)
 
 
 def test_an_update_where_it_is_exact_already_solves_no_displacement_again(first, twin, directions):

@@ -79,6 +79,39 @@ def test_what_is_left_out_could_explain_less_than_it_may(rng):
     assert np.linalg.eigvalsh(narrow + rest - whole).min() > -1e-9  # what is left at its prior is no narrower
 
 
+def test_a_motion_of_several_images_leaves_out_no_more_of_any_of_them(rng):
+    n = 40
+    covariance, informations = spread(rng, n), [size * spread(rng, n) for size in (4.0, 40.0, 10.0)]
+    block = Block("a", "b", Acts.BOUNDARY, (0,), np.linalg.inv(covariance), ((covariance,),), amplitudes=(0.1, 1.0))
+    basis, inverse = informed.informed_combinations(block, *informations)
+    assert basis.shape[1] < n
+    left = np.eye(n) - basis @ inverse
+    assert all(np.trace(seen @ left @ covariance @ left.T) < block.left_out for seen in informations)
+
+
+def test_images_of_one_body_have_the_same_combinations_of_a_motion_and_one_model_of_them(twins, twin):
+    """The answer is that with all unknowns, which each image has for itself."""
+    one, size = twins.exact_problem(twin, twins.deformed(twin.model, seed=6)), twin.model.n_modes
+    own = ((4.0 * np.eye(size),),)
+    parameters = one.parameters
+
+    def problem(left_out):
+        blocks = [
+            Block("wall", "driver", Acts.BOUNDARY, (s,), np.eye(size), own, amplitudes=(0.5, 1.0), left_out=left_out)
+            for s in range(2)
+        ]
+        return replace(one, parameters=replace(parameters, blocks=tuple(blocks), nuisance_precision=np.zeros((0, 0))))
+
+    start = informed.informed_start(problem(1e3), np.zeros(2), progress=twins.silent)
+    first, second = start.objective.approximations
+    assert first.constraint.modes is second.constraint.modes
+    assert first.constraint.n_modes < size
+    assert first.full_model.coupling is second.full_model.coupling
+    assert first.model.output_basis[0] is second.model.output_basis[0]
+    free, fixed = (informed.informed_start(problem(amount), np.zeros(2), progress=twins.silent) for amount in (0.0, -1))
+    assert free.minimum.evaluation.value == pytest.approx(fixed.minimum.evaluation.value, rel=1e-4)
+
+
 def test_offsets_and_what_is_not_learned_stay_as_they_are():
     own = ((np.eye(13),),)
     for acts, alternatives in ((Acts.RESIDUALS, own), (Acts.MODULI, ()), (Acts.MATERIAL, ()), (Acts.BOUNDARY, ())):

@@ -442,11 +442,12 @@ def unfollowed(basis, times):
         def error(self, _at):
             return ModelError(np.inf, np.zeros(0))
 
-        def update(self, at, others=()):
+        @classmethod
+        def update_all(cls, bases, points):
             if len(failures) < times:
                 failures.append(1)
                 raise NotConverged("folded")
-            return super().update(at, others)
+            return super().update_all(bases, points)
 
     return Unfollowed(*(getattr(basis, field.name) for field in fields(basis)))
 

@@ -150,6 +150,18 @@ def test_combinations_of_free_displacements_are_those_in_double_precision(model,
     assert np.allclose(found, model.constraint.free.T @ displacements @ combinations, rtol=0.0, atol=1e-5)
 
 
+def test_a_projection_serves_another_state_of_the_body_on_the_same_vectors(model):
+    """Its offset and loads are others, its modes are the same."""
+    vectors, moduli, q = basis(model), np.array([1.0, 5.0]), np.array([1.0, -2.0])
+    constraint = replace(model.constraint, offset=-0.3 * model.constraint.offset)
+    other = model.under(replace(model.conditions, constraint=constraint))
+    first = projection(model, vectors)
+    there, anew = first.under(other), projection(other, vectors)
+    assert there.reduced.output_basis[0] is first.reduced.output_basis[0]
+    assert there.reduced.solve(moduli, q).values == pytest.approx(anew.reduced.solve(moduli, q).values, abs=1e-9)
+    assert first.under(model.under(model.conditions)).reduced is first.reduced
+
+
 def test_what_is_there_already_extends_nothing(model):
     snapshots = basis(model)
     small = projection(model, snapshots)

@@ -109,11 +109,18 @@ class Approximation(Protocol):
         """Moduli (n_regions,) kPa where the derivatives that decide the estimate are exact; None: nowhere yet."""
         ...
 
-    def update(self, at: LinearisationPoint, others: Sequence[Self] = ()) -> Self:
+    def update(self, at: LinearisationPoint) -> Self:
         """The approximation made exact at a place: the displacement, and the derivatives along its directions.
 
-        others: of other states of the body, which are exact at these moduli already: their factorisation may serve.
         Raises `NotConverged` when the full model has no equilibrium there, `SolverError` when it cannot be solved.
+        """
+        ...
+
+    @classmethod
+    def update_all(cls, each: Sequence[Self], points: Sequence[LinearisationPoint]) -> list[Self]:
+        """Those of several states made exact, each at its place: what their models share is done once.
+
+        Raises as `update` does.
         """
         ...
 
@@ -129,10 +136,7 @@ class Approximation(Protocol):
 
 def updated(approximations: Sequence[Approximation], points: Sequence[LinearisationPoint]) -> list[Approximation]:
     """The approximation of each state made exact at its place; raises as `Approximation.update` does."""
-    found = list[Approximation]()
-    for approximation, point in zip(approximations, points, strict=True):
-        found.append(approximation.update(point, found))
-    return found
+    return list(type(approximations[0]).update_all(approximations, points)) if approximations else []
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,12 +173,18 @@ class ExactApproximation:
         """Moduli (n_regions,) kPa where the model was last solved: there all derivatives are exact."""
         return self.place.moduli
 
-    def update(self, at: LinearisationPoint, others: Sequence[ExactApproximation] = ()) -> ExactApproximation:
+    def update(self, at: LinearisationPoint) -> ExactApproximation:
         """The model solved at a place, and expanded there; raises as `Approximation.update` does."""
-        del others
         if at.same_as(self.place):
             return self
         return exact_approximation(self.linear, self.finite_strain, at, nearby=self)
+
+    @classmethod
+    def update_all(
+        cls, each: Sequence[ExactApproximation], points: Sequence[LinearisationPoint]
+    ) -> list[ExactApproximation]:
+        """Those of several states, one after the other."""
+        return [one.update(at) for one, at in zip(each, points, strict=True)]
 
     @property
     def error_counts(self) -> SolveCounts:

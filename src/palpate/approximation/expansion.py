@@ -64,14 +64,13 @@ class Expansion:
         """Where it is exact."""
         return LinearisationPoint(self.equilibrium.moduli, self.equilibrium.coefficients)
 
-    def update(self, at: LinearisationPoint, others: Sequence[Expansion] = ()) -> Expansion:
+    def update(self, at: LinearisationPoint) -> Expansion:
         """The expansion around the equilibrium at another place, derivatives exact there along its directions.
 
         Along all where they are few. With directions D, the exact C along them and H the metric T becomes
         T + (C - T D) (D^T H D)^+ D^T H: of all T' with T' D = C the one that changes least. The other columns stay as
         they were where T was made. Raises `NotConverged` when there is no equilibrium.
         """
-        del others  # each state has a tangent stiffness of its own
         there, before = self, self.equilibrium
         if not at.same_as(self.place):  # start at the displacement of the expansion, else at the present one
             start = self.model.solve(at.moduli, at.coefficients).displacement
@@ -92,6 +91,11 @@ class Expansion:
         sharper = replace(there.model, derivatives=there.model.derivatives + change @ share)
         spent = there.counts + SolveCounts(tangent=directions.shape[1])
         return replace(there, model=sharper, counts=spent, derivatives_at=there.equilibrium.moduli)
+
+    @classmethod
+    def update_all(cls, each: Sequence[Expansion], points: Sequence[LinearisationPoint]) -> list[Expansion]:
+        """Those of several states, one after the other: each has a tangent stiffness of its own."""
+        return [one.update(at) for one, at in zip(each, points, strict=True)]
 
     @property
     def error_counts(self) -> SolveCounts:

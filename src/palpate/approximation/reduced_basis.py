@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from scipy import sparse
 
 from palpate.approximation.contract import LinearisationPoint, ModelError, determined
 from palpate.mechanics.forward import SolveCounts
-from palpate.mechanics.linear_model import LinearModel, LinearSystem, of_same_body
+from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.mechanics.reduced import Projection, ReducedModel, projection
 from palpate.mechanics.solvers.conjugate_gradients import Product, conjugate_gradients, times
 from palpate.mechanics.solvers.contract import Factorisation
@@ -25,9 +26,12 @@ FAR_ALONE = 300.0  # the same for a single right-hand side, which takes some 4 s
 SNAPSHOT = 1e-5  # relative residual of basis vectors; their error is measured, and corrected, at each place
 DISPLACEMENT, TANGENT = 3e-4, 1e-2  # of the reduced model's error, that a correction may leave
 STALE = 0.3  # change of ln E after which all responses to the material modes are made anew
-MANY = 128  # responses to material modes, as of a map, for which a new factorisation is cheaper than iterations
+ITERATIONS = 3.0, 5.0  # of conjugate gradients: at least, and for each unit of sqrt(spread) - 1 of moduli's ratios
+MAKING = 2.5e-5  # seconds an unknown that a factorisation takes beside elimination: its matrix, and its probes
 FAR_OFF = 3e-3  # missing share of the displacement, below which derivatives are wrong by as small a share
 MAX_ITERATIONS = 120
+FEW = 12  # right-hand sides, of which an iteration takes no less time: the factor is read once
+TOGETHER = 64  # right-hand sides of several states that are solved for together
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,49 +78,35 @@ class ReducedBasis:
         """Moduli (n_regions,) kPa where it was last made exact with its derivatives."""
         return None if self.place is None or self.place.directions is None else self.place.moduli
 
-    def update(self, at: LinearisationPoint, others: Sequence[ReducedBasis] = ()) -> ReducedBasis:
-        """Add what the reduced model misses at a place: of the displacement there, and of its derivatives.
+    def update(self, at: LinearisationPoint) -> ReducedBasis:
+        """The basis made exact at a place, as `update_all` does it for the states of a body together."""
+        return self.update_all([self], [at])[0]
+
+    @classmethod
+    def update_all(cls, bases: Sequence[ReducedBasis], points: Sequence[LinearisationPoint]) -> list[ReducedBasis]:
+        """Add what reduced models miss at their places: of the displacement there, and of its derivatives.
 
         Both are corrections by conjugate gradients with the factorisation that is there, from the reduced answers on;
-        where it is none, or the moduli are far from its own, with a new one, which other states of the body share. The
-        derivatives, sought together with the
+        where it is none, or the moduli are so far from its own that a new one costs less, with that. States of one body
+        at the same moduli share it, and are solved for together. The derivatives, sought together with the
         displacement, are those of the reduced one, and of what it missed where that is no small share. Raises
         `SolverError`.
         """
-        model, near, sharper = self.full_model, self.system, self
-        direct = isinstance(near.factorisation, CheckedFactorisation) and SOLVERS[near.factorisation.solver].direct
-        ratios, every = at.moduli / near.moduli, at.directions is not None and self._stale(at)
-        many = every and model.material.n_modes > MANY
-        far = FAR if at.directions is not None else FAR_ALONE
-        # a solver that iterates is no preconditioner; for many right-hand sides a new factorisation pays
-        if many or not direct or ratios.max() >= far * ratios.min():
-            shared = of_same_body(model, at.moduli, (other.system for other in others))
-            near = shared or model.system(at.moduli)
-            sharper = replace(self, system=near, counts=self.counts + SolveCounts(factorisations=int(not shared)))
-        displacement, along = self._homogeneous(at), _Directions.at(at, model, every=every)
-        product = partial(model.free_forces, at.moduli)
-        new = int(not at.same_as(self.place))  # whether the displacement is solved for, too
-
-        def solved(rhs: NDArray[np.float64], tolerance: float | NDArray[np.float64]) -> NDArray[np.float64]:
-            """Solution (n_free, k) mm at the place to a relative residual, one or (k,)."""
-            nearly = near.factorisation.nearly
-            return conjugate_gradients(product, rhs, nearly, tolerance=tolerance, max_iterations=MAX_ITERATIONS)[0]
-
-        sought = -model.residual(at.moduli, displacement[:, None])[:, :new]
-        loads = np.concatenate([sought, self._lacking(at, displacement, along, product)], axis=1)
-        if loads.shape[1]:
-            missing = solved(loads, np.array([DISPLACEMENT] * new + [TANGENT] * along.number))
-            cost = SolveCounts(forward=new, tangent=along.number)
-            late = np.asarray(model.constraint.free @ missing[:, :new])
-            if along.number and np.linalg.norm(late) > FAR_OFF * np.linalg.norm(displacement):
-                missing[:, new:] += solved(along.by_displacement(model).loads(model, at.moduli, late[:, 0]), TANGENT)
-                cost += SolveCounts(tangent=along.number)
-            last = new + along.boundary.shape[1]
-            material = _changed(along.material, at.metric, missing[:, last:], every=every)
-            responses = self.model.output_material + times(model.constraint.free, material)
-            sharper = sharper.with_material(responses, at.moduli if every else self.material_at)
-            sharper = _extended(replace(sharper, place=at), missing[:, :last], cost)
-        return sharper
+        found = [_Missing.of(basis, at) for basis, at in zip(bases, points, strict=True)]
+        sharper, left = dict[int, ReducedBasis](), list(range(len(found)))
+        while left:
+            alike = [i for i in left if found[i].alike(found[left[0]])]
+            left = [i for i in left if i not in alike]
+            near, made = _near([found[i] for i in alike])
+            if made:
+                counts = found[alike[0]].basis.counts + SolveCounts(factorisations=1)
+                found[alike[0]] = replace(found[alike[0]], basis=replace(found[alike[0]].basis, counts=counts))
+            while alike:  # some of them at a time, as far as right-hand sides have room
+                numbers = np.cumsum([found[i].number for i in alike])
+                some = alike[: max(1, int(np.searchsorted(numbers, TOGETHER, side="right")))]
+                alike = alike[len(some) :]
+                sharper |= zip(some, _corrected([found[i] for i in some], near), strict=True)
+        return [sharper[i] for i in range(len(found))]
 
     @property
     def error_counts(self) -> SolveCounts:
@@ -128,7 +118,7 @@ class ReducedBasis:
 
         Of its parts, too, that follow the material modes.
         """
-        model, displacement = self.full_model, self._homogeneous(at)
+        model, displacement = self.full_model, self.homogeneous(at)
         material = at.coefficients[model.constraint.n_modes :, None]
         if not np.any(material):
             return ModelError(*self.system.error_bound(at.moduli, displacement))
@@ -136,11 +126,11 @@ class ReducedBasis:
         whole = displacement + (self.model.output_material @ material)[:, 0]
         return ModelError(*self.system.error_bound(at.moduli, whole, np.asarray(model.constraint.free.T @ forces)))
 
-    def with_material(self, responses: NDArray[np.float64], moduli: NDArray[np.float64]) -> ReducedBasis:
+    def with_material(self, responses: NDArray[np.floating[Any]], moduli: NDArray[np.float64]) -> ReducedBasis:
         """With the responses (n_dof, n_material) mm to the material modes at moduli (n_regions,) kPa."""
         return replace(self, projection=self.projection.with_material(responses), material_at=moduli)
 
-    def _stale(self, at: LinearisationPoint) -> bool:
+    def stale(self, at: LinearisationPoint) -> bool:
         """Whether responses to the material modes are not there yet, or of far from a place that asks for them all."""
         if not self.full_model.material.n_modes:
             return False
@@ -148,25 +138,11 @@ class ReducedBasis:
             return True
         return at.all_material and bool(np.abs(np.log(at.moduli / self.material_at)).max() > STALE)
 
-    def _homogeneous(self, at: LinearisationPoint) -> NDArray[np.float64]:
+    def homogeneous(self, at: LinearisationPoint) -> NDArray[np.float64]:
         """The displacement (n_dof,) mm at a place as it would be of homogeneous tissues."""
         boundary = self.full_model.constraint.n_modes
         of_boundary = np.where(np.arange(len(at.coefficients)) < boundary, at.coefficients, 0.0)
         return self.model.solve(at.moduli, of_boundary).values
-
-    def _lacking(
-        self, at: LinearisationPoint, displacement: NDArray[np.float64], along: _Directions, product: Product
-    ) -> NDArray[np.float64]:
-        """What the derivatives that are there leave of their loads (n_free, k), mN, at a place along directions.
-
-        displacement (n_dof,) mm; product: with the stiffness there.
-        """
-        if not along.number:
-            return np.zeros((self.constraint.free.shape[1], 0))
-        loads, first = along.loads(self.full_model, at.moduli, displacement), along.boundary.shape[1]
-        amplitudes = self.model.system(at.moduli).backward(self.projection.components(loads[:, :first]))
-        material = np.asarray(self.constraint.free.T @ (self.model.output_material @ along.material))
-        return loads - product(np.concatenate([self.projection.spanned(amplitudes), material], axis=1))
 
     def with_modulus_series(self, coefficients: NDArray[np.float64], by_theta: NDArray[np.float64]) -> ReducedBasis:
         """Add how the displacement at `coefficients` (n_modes,) changes with the parameters, to high order.
@@ -177,7 +153,7 @@ class ReducedBasis:
         """
         model, system, regions = self.full_model, self.system, np.flatnonzero(by_theta.any(axis=1))
         n_parameters = by_theta.shape[1]
-        level = self._homogeneous(LinearisationPoint(system.moduli, coefficients))[:, None]
+        level = self.homogeneous(LinearisationPoint(system.moduli, coefficients))[:, None]
         vectors: list[NDArray[np.float64]] = []
         while level.shape[1] * n_parameters + sum(v.shape[1] for v in vectors) <= SERIES:
             by_region = system.modulus_responses(level, regions=regions, tolerance=SNAPSHOT)
@@ -246,6 +222,153 @@ class _Directions:
             return loads
         forces = model.material_forces(moduli, displacement, self.material)
         return np.concatenate([loads, -np.asarray(model.constraint.free.T @ forces)], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class _Missing:
+    """What a basis is asked for at a place: the displacement, and derivatives along directions.
+
+    every: by all material modes; displacement (n_dof,) mm: that of the reduced model, of homogeneous tissues; new: 1
+    where the displacement is sought, too, else 0.
+    """
+
+    basis: ReducedBasis
+    at: LinearisationPoint
+    every: bool
+    along: _Directions
+    displacement: NDArray[np.float64]
+    new: int
+
+    @classmethod
+    def of(cls, basis: ReducedBasis, at: LinearisationPoint) -> _Missing:
+        """What it is of a basis at a place."""
+        every = at.directions is not None and basis.stale(at)
+        along = _Directions.at(at, basis.full_model, every=every)
+        return cls(basis, at, every, along, basis.homogeneous(at), int(not at.same_as(basis.place)))
+
+    @property
+    def number(self) -> int:
+        """How many right-hand sides it takes."""
+        return self.new + self.along.number
+
+    @property
+    def tolerances(self) -> list[float]:
+        """The relative residual of each."""
+        return [DISPLACEMENT] * self.new + [TANGENT] * self.along.number
+
+    def alike(self, other: _Missing) -> bool:
+        """Whether another one is of the same matrix."""
+        same = self.basis.full_model.same_stiffness(other.basis.full_model)
+        return same and np.array_equal(self.at.moduli, other.at.moduli)
+
+    def loads(self, product: Product | None) -> NDArray[np.float64]:
+        """Loads (n_free, number), mN, of what is sought: of the missing displacement, and of the derivatives.
+
+        product: with the stiffness at the place, to have only what the derivatives that are there leave of theirs.
+        """
+        model, moduli, displacement, along = self.basis.full_model, self.at.moduli, self.displacement, self.along
+        sought = -model.residual(moduli, displacement[:, None])[:, : self.new]
+        if not along.number:
+            return sought
+        loads, first = along.loads(model, moduli, displacement), along.boundary.shape[1]
+        if product is not None:
+            projection = self.basis.projection
+            amplitudes = projection.reduced.system(moduli).backward(projection.components(loads[:, :first]))
+            loads -= product(np.concatenate([projection.spanned(amplitudes), self.known], axis=1))
+        return np.concatenate([sought, loads], axis=1)
+
+    @property
+    def known(self) -> NDArray[np.float64]:
+        """The responses (n_free, k) mm that are there, along the directions of the material."""
+        free, responses = self.basis.constraint.free, self.basis.model.output_material
+        return np.asarray(free.T @ (responses if self.every else responses @ self.along.material), dtype=np.float64)
+
+    def further_loads(self, missing: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Loads (n_free, k), mN, of derivatives of what was `missing` (n_free, number) mm of the displacement.
+
+        None where that is a small share.
+        """
+        late = np.asarray(self.basis.constraint.free @ missing[:, : self.new])
+        if self.along.number and np.linalg.norm(late) > FAR_OFF * np.linalg.norm(self.displacement):
+            model = self.basis.full_model
+            return self.along.by_displacement(model).loads(model, self.at.moduli, late[:, 0])
+        return missing[:, :0]
+
+    def corrected(self, near: LinearSystem, missing: NDArray[np.float64], cost: SolveCounts) -> ReducedBasis:
+        """The basis with what was missing (n_free, number) mm, found with the factorisation of a system."""
+        last = self.new + self.along.boundary.shape[1]
+        basis, at, sharper = self.basis, self.at, replace(self.basis, system=near.of(self.basis.full_model))
+        if not self.number:
+            return replace(sharper, counts=sharper.counts + cost)
+        if self.along.material.shape[1]:
+            before = basis.model.output_material
+            change = _changed(self.along.material, at.metric, missing[:, last:], every=self.every)
+            responses = (before + times(basis.constraint.free, change)).astype(before.dtype, copy=False)
+            sharper = sharper.with_material(responses, at.moduli if self.every else basis.material_at)
+        return _extended(replace(sharper, place=at), missing[:, :last], cost)
+
+
+def _corrected(found: Sequence[_Missing], near: LinearSystem) -> list[ReducedBasis]:
+    """The bases of states of one body at the same moduli, with what they miss there, by the factorisation of `near`."""
+    model, moduli = found[0].basis.full_model, found[0].at.moduli
+    exact = np.array_equal(near.moduli, moduli)  # then one solution is all, and nothing known shortens it
+    product = partial(model.free_forces, moduli)
+
+    def solved(loads: Sequence[NDArray[np.float64]], tolerances: Sequence[float]) -> list[NDArray[np.float64]]:
+        """Solutions (n_free, k) mm for the loads of each state."""
+        rhs, ends = np.concatenate(loads, axis=1), np.cumsum([of.shape[1] for of in loads])[:-1]
+        if not rhs.shape[1]:
+            return list(loads)
+        if exact:
+            every = near.factorisation.solve(rhs, tolerance=SNAPSHOT)
+        else:
+            steps, nearly = MAX_ITERATIONS, near.factorisation.nearly
+            every, _ = conjugate_gradients(product, rhs, nearly, tolerance=np.array(tolerances), max_iterations=steps)
+        return np.split(every, ends, axis=1)
+
+    loads = [of.loads(None if exact else product) for of in found]
+    missing = solved(loads, [tolerance for of in found for tolerance in of.tolerances])
+    del loads
+    if exact:
+        for of, own in zip(found, missing, strict=True):
+            own[:, of.new + of.along.boundary.shape[1] :] -= of.known
+    further = [of.further_loads(own) for of, own in zip(found, missing, strict=True)]
+    later = solved(further, [TANGENT] * sum(of.shape[1] for of in further))
+    sharper = list[ReducedBasis]()
+    for of, own, more in zip(found, missing, later, strict=True):
+        if more.shape[1]:
+            own[:, of.new :] += more
+        cost = SolveCounts(forward=of.new, tangent=of.along.number + more.shape[1])
+        sharper.append(of.corrected(near, own, cost))
+    return sharper
+
+
+def _near(found: Sequence[_Missing]) -> tuple[LinearSystem, bool]:
+    """The system whose factorisation serves bases of one body at the same moduli, and whether it is made for them.
+
+    A new one where the moduli are far from those of the one that is there, or where that costs less than the iterations
+    it saves, and where the solver iterates, which is no preconditioner.
+    """
+    model, moduli = found[0].basis.full_model, found[0].at.moduli
+
+    def spread(system: LinearSystem) -> float:
+        """Condition number of the stiffness there with the factorised one."""
+        ratios = moduli / system.moduli
+        return float(ratios.max() / ratios.min())
+
+    near = min((of.basis.system for of in found), key=spread)
+    factorisation, number = near.factorisation, sum(of.number for of in found)
+    if not number or np.array_equal(near.moduli, moduli):
+        return near, False
+    far = FAR if any(of.at.directions is not None for of in found) else FAR_ALONE
+    if isinstance(factorisation, CheckedFactorisation) and SOLVERS[factorisation.solver].direct and spread(near) < far:
+        solver = SOLVERS[factorisation.solver]
+        unknowns = factorisation.matrix.shape[0]
+        made, once = (solver.expect_of_size(unknowns, n).seconds for n in (0, max(number, FEW)))
+        steps = ITERATIONS[0] + ITERATIONS[1] * (np.sqrt(spread(near)) - 1.0)
+        if steps * (once - made) < made + MAKING * unknowns:
+            return near, False
+    return model.system(moduli), True
 
 
 def reduced_basis(model: LinearModel, moduli: NDArray[np.float64]) -> ReducedBasis:

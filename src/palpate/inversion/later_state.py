@@ -52,16 +52,24 @@ class LaterState:
         """What is observed (n_observed,) or (n_observed, k) of displacements (n_dof,) or (n_dof, k) mm, in order."""
         return np.concatenate([seen_by(observation, displacement) for observation in self.observations])
 
-    def combined(self, boundary: NDArray[np.float64], fields: NDArray[np.float64]) -> LaterState:
-        """The same state with models on combinations of boundary modes (n_boundary, k) and of fields (n_fields, l)."""
-        modes, moved = self.model.constraint.modes, np.flatnonzero(self.model.constraint.modes.any(axis=1))
-        combined = np.zeros((len(modes), boundary.shape[1]))
-        combined[moved] = modes[moved] @ boundary
+    def combined(
+        self, boundary: NDArray[np.float64], fields: NDArray[np.float64], like: LinearModel | None = None
+    ) -> LaterState:
+        """The same state with models on combinations of boundary modes (n_boundary, k) and of fields (n_fields, l).
+
+        like: the model of another state of the body on the same combinations, whose modes and material serve again.
+        """
+        if like is None:
+            modes, moved = self.model.constraint.modes, np.flatnonzero(self.model.constraint.modes.any(axis=1))
+            combined = np.zeros((len(modes), boundary.shape[1]))
+            combined[moved] = modes[moved] @ boundary
+            material = self.model.material.combined(fields)
+        else:
+            combined, material = like.constraint.modes, like.material
         constraint = replace(self.model.constraint, modes=combined)
-        material = self.model.material.combined(fields)
         conditions = replace(self.model.conditions, constraint=constraint)
         finite = self.finite_strain and replace(self.finite_strain.under(conditions), material=material)
-        model = replace(self.model.under(conditions), material=material)
+        model = replace((like or self.model).under(conditions), material=material)
         seen = tuple(o.combined(fields) if isinstance(o, OfMaterial) else o for o in self.observations)
         return replace(self, model=model, observations=seen, finite_strain=finite)
 

@@ -53,7 +53,7 @@ class Searched:
 
     The evaluation is that under the likeliest explanation. mixture: None before the first iteration. settled: whether
     the noise is fitted, after which the objective stays as it is. moved: by how many of its standard deviations the
-    mean moved last.
+    mean moved last; share: of that way the search goes, less where it went to and fro.
     """
 
     objective: Objective
@@ -61,6 +61,7 @@ class Searched:
     mixture: Mixture | None = None
     settled: bool = False
     moved: float = np.inf
+    share: float = 1.0
 
     @property
     def posterior(self) -> Mixture:
@@ -146,8 +147,22 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         evaluation = evaluation.under(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
         return replace(now, objective=objective, minimum=minimum, mixture=mixture, moved=moved)
-    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=now.settled or moved < 1.0)
-    return _taken(before, evaluation, target)
+    share = _share(now, mixture, theta, sd)
+    settled = now.settled or moved < 1.0
+    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled, share=share)
+    return _taken(before, evaluation, at.unknowns + share * (target - at.unknowns))
+
+
+def _share(now: Searched, mixture: Mixture, theta: NDArray[np.float64], sd: NDArray[np.float64]) -> float:
+    """The share of the way to the mean that the search goes from theta (n_parameters,).
+
+    Half as much as before where the way leads back, in standard deviations (n_parameters,), else twice as much.
+    """
+    if len(now.minimum.history) < 2:
+        return now.share
+    last = (theta - now.minimum.history[-2].theta) / sd
+    back = float(last @ ((mixture.mean - theta) / sd)) < 0.0
+    return 0.5 * now.share if back else min(2.0 * now.share, 1.0)
 
 
 def _fitted(now: Searched, near: Bounds) -> tuple[Objective, Evaluation]:
@@ -161,8 +176,9 @@ def _fitted(now: Searched, near: Bounds) -> tuple[Objective, Evaluation]:
         found = gauss_newton(linear, at.unknowns, bounds=near, tolerance=NEAR)
         if not now.settled:
             objective = with_scales(with_correlations(objective, found.evaluation), found.evaluation)
-            here = LinearisedObjective(objective, at.unknowns, at.evaluation)(found.unknowns)
-            objective = with_amplitudes(objective, here, found.unknowns)
+    if not now.settled:
+        here = LinearisedObjective(objective, at.unknowns, at.evaluation)(found.unknowns)
+        objective = with_amplitudes(objective, here, found.unknowns)
     like = LinearisedObjective(objective, at.unknowns, at.evaluation)(found.unknowns).linearisations
     return objective, objective.weighed(at.unknowns, at.evaluation.linearisations, like)
 
@@ -182,7 +198,7 @@ def _taken(now: Searched, evaluation: Evaluation, target: NDArray[np.float64]) -
     before = evaluation.under(objective.parameters, at.unknowns).value
     for _ in range(HALVINGS):
         try:
-            there = _exact(objective, evaluation.under(objective.parameters, at.unknowns), target)
+            there = _exact(objective, evaluation.under(objective.parameters, at.unknowns), target, near=now.settled)
         except (NotConverged, SolverError) as error:
             failure, target = error, at.unknowns + 0.5 * (target - at.unknowns)
             continue
@@ -196,15 +212,17 @@ def _taken(now: Searched, evaluation: Evaluation, target: NDArray[np.float64]) -
     return replace(now, minimum=replace(at, outcome=Outcome.STUCK, evaluations=evaluations))
 
 
-def _exact(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> Objective:
+def _exact(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64], *, near: bool) -> Objective:
     """The objective matched at unknowns (n_unknowns,), its models exact there along the directions that decide.
 
-    These are those of the evaluation nearby, with layers and without.
+    These are those of the evaluation nearby, under the likeliest explanation and with the widest tissues. near: whether
+    the end is so near that derivatives by all material modes are made exact, too.
     """
     wide = dict[int, int]()
     for i, block in enumerate(objective.parameters.blocks):
         if block.choice.of_tissues:
             wide[i] = len(block.alternatives) - 1
     other = evaluation.under(objective.parameters.choosing(wide), unknowns)
-    points = objective.linearisation_points(unknowns, [evaluation, other] if wide else [evaluation])
+    both = [evaluation, other] if wide else [evaluation]
+    points = objective.linearisation_points(unknowns, both, all_material=near)
     return objective.under(updated(objective.approximations, points)).rematched(unknowns)

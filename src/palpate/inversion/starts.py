@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from palpate.approximation.reduced_basis import SNAPSHOT, ReducedBasis, basis_of
+from palpate.approximation.reduced_basis import SNAPSHOT, ReducedBasis
 from palpate.inversion.frozen_posterior import Posterior
 from palpate.inversion.hyper_parameters import with_first_noise
 from palpate.inversion.later_state import InverseProblem, LaterState
@@ -25,7 +25,7 @@ from palpate.inversion.search import Searched, begun
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem, of_same_body
-from palpate.mechanics.reduced import free_combinations
+from palpate.mechanics.reduced import Projection, free_combinations, projection
 from palpate.parallel import mapped
 from palpate.progress import Progress
 from palpate.unknowns.blocks import FIELD, Acts, Block, Choice
@@ -92,13 +92,13 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
     middle, evaluations = fitted.unknowns, fitted.evaluations + 1
     # free the large derivatives of everything observed by all unknowns
     del objective, states, state, fitted, evaluation
-    bases = [
-        informed_combinations(b, data[np.ix_(own, own)]) for b, own in zip(parameters.blocks, columns, strict=True)
-    ]
+    informations = [data[np.ix_(own, own)] for own in columns]
+    bases = _combinations(parameters.blocks, informations, [state.model for state in start.states])
     fit = [inverse @ middle[own] for own, (_, inverse) in zip(columns, bases, strict=True)]
     unknowns = np.concatenate([theta, *fit])
     blocks = tuple(b.combined(inverse) for b, (_, inverse) in zip(parameters.blocks, bases, strict=True))
     seen, informed = replace(parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0))), list[LaterState]()
+    made = list[_Made]()
     progress(f"how the responses to the {seen.n_coefficients} unknowns that the images show change with the moduli")
     for s, (state, q) in enumerate(zip(start.states, seen.coefficients(unknowns), strict=True)):
         of_state = [(b.acts, basis) for b, (basis, _) in zip(parameters.blocks, bases, strict=True) if s in b.states]
@@ -108,8 +108,13 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
         )
         n_poisson = len(state.model.material.poisson)
         fields = material[: material.shape[0] - n_poisson, : material.shape[1] - n_poisson]
-        reduced = state.combined(boundary, fields)
-        basis = found.pop(0).combined(reduced.model, boundary, material)
+        modes = state.model.constraint.modes
+        like = next((of for of in made if of.modes is modes and np.array_equal(of.boundary, boundary)), None)
+        reduced = state.combined(boundary, fields, like.projection.model if like else None)
+        responses = found.pop(0)
+        projected = like.projection.under(reduced.model) if like else responses.projected(reduced.model, boundary)
+        made += [] if like else [_Made(modes, boundary, projected)]
+        basis = responses.basis(projected, material)
         informed.append(reduced.with_approximation(basis.with_modulus_series(q, seen.derivatives(unknowns))))
     return begun(Objective(tuple(informed), seen), unknowns, evaluations=evaluations)
 
@@ -160,18 +165,47 @@ class _Responses:
         values = alone + tangent[:, len(moduli) :] @ coefficients
         return FirstOrderModel(model.names, moduli, coefficients, values, tangent)
 
-    def combined(
-        self, model: LinearModel, boundary: NDArray[np.float64], material: NDArray[np.float64]
-    ) -> ReducedBasis:
-        """The reduced basis of combinations (n_boundary, k) and (n_material, l), of which `model` is made."""
-        cost = self.cost + SolveCounts(tangent=self.material.shape[1])
-        snapshots = free_combinations(model, self.boundary, boundary.astype(np.float32))
+    def projected(self, model: LinearModel, boundary: NDArray[np.float64]) -> Projection:
+        """A model on its responses to combinations (n_boundary, k) of the modes, of which it is made."""
+        return projection(model, free_combinations(model, self.boundary, boundary.astype(np.float32)), overwrite=True)
+
+    def basis(self, projected: Projection, material: NDArray[np.float64]) -> ReducedBasis:
+        """The reduced basis of these, of what stands alone, and of combinations (n_material, l) of material modes."""
+        cost, model = self.cost + SolveCounts(tangent=self.material.shape[1]), projected.model
         if np.any(self.alone):
             own = np.asarray(model.constraint.free.T @ self.alone, dtype=np.float64)
-            snapshots = np.column_stack([snapshots, own])
-        basis = basis_of(self.system.of(model), snapshots, cost)
-        responses = np.asarray(self.material @ material.astype(np.float32), dtype=np.float64)
-        return basis.with_material(responses, self.system.moduli)
+            projected = projected.extended(own[:, None])
+        basis = ReducedBasis(projected, self.system.of(model), cost)
+        return basis.with_material(self.material @ material.astype(np.float32), self.system.moduli)
+
+
+@dataclass(frozen=True, slots=True)
+class _Made:
+    """The projection on combinations (n_boundary, k) of boundary modes (n_dof, n_boundary) of the states of a body."""
+
+    modes: NDArray[np.float64]
+    boundary: NDArray[np.float64]
+    projection: Projection
+
+
+def _combinations(
+    blocks: Sequence[Block], informations: Sequence[NDArray[np.float64]], models: Sequence[LinearModel]
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """The informed combinations of each block; motions of one thing in several images of a body have the same ones.
+
+    Each image then sees all that it sees of them, and models on them are made once. models: of each state.
+    """
+    groups = dict[object, list[int]]()
+    for number, (block, state) in enumerate((block, block.states[0]) for block in blocks):
+        before = sum(b.states == block.states and b.acts is block.acts for b in blocks[:number])
+        alone = block.acts is not Acts.BOUNDARY or len(block.states) > 1
+        modes = id(models[state].constraint.modes)
+        groups.setdefault(number if alone else (before, block.of, block.cause, block.size, modes), []).append(number)
+    found = dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]]()
+    for own in groups.values():
+        shared = informed_combinations(blocks[own[0]], *(informations[number] for number in own))
+        found |= dict.fromkeys(own, shared)
+    return [found[number] for number in range(len(blocks))]
 
 
 def fit_coefficients(
@@ -195,18 +229,24 @@ def fit_coefficients(
 
 
 def informed_combinations(
-    block: Block, information: NDArray[np.float64]
+    block: Block, *informations: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Combinations (n, k) of a block's unknowns that data of an information (n, n) see, and their inverse (k, n).
+    """Combinations (n, k) of a block's unknowns that data of informations (n, n) see, and their inverse (k, n).
 
     Of a motion or a field whose prior is learned, at least the one that is seen most. Other unknowns stay as they are:
-    Poisson's ratios have a tissue each.
+    Poisson's ratios have a tissue each. With several
+    informations, those of a motion in several images, they are the eigenvectors for the mean, and so many that for none
+    of them more is left out.
     """
     if not block.terms and block.choice not in (Choice.FRAME, Choice.PATCHINESS):
         return np.eye(block.size), np.eye(block.size)
     root = linalg.cholesky(block.widest, lower=True)
-    sizes, vectors = linalg.eigh(root.T @ information @ root)
-    left = np.cumsum(np.maximum(sizes, 0.0)) < (LEFT_OUT_OF_MAP if block.cause == FIELD else LEFT_OUT)
+    of_images = [root.T @ information @ root for information in informations]
+    _, vectors = linalg.eigh(np.mean(of_images, axis=0))
+    sizes = [np.einsum("ij,ij->j", vectors, seen @ vectors) for seen in of_images]
+    left = np.max(np.cumsum(np.maximum(sizes, 0.0), axis=1), axis=0) < (
+        LEFT_OUT_OF_MAP if block.cause == FIELD else LEFT_OUT
+    )
     left[-1:] = False
     kept = vectors[:, ~left][:, ::-1]
     unit = float(np.sqrt(np.mean(np.diag(block.widest))))  # coefficients keep their size

@@ -82,7 +82,9 @@ class LinearModel:
         Raises `ConfigurationError` when the conditions leave other displacements free than the model's own.
         """
         conditions.require_same_free(self.constraint)
-        constraint = conditions.constraint
+        constraint, own = conditions.constraint, self.constraint
+        if self.coupling and constraint.modes is own.modes and np.array_equal(constraint.offset, own.offset):
+            return replace(self, conditions=conditions)  # other loads alone, and one coupling in memory
         both = [sparse.csr_matrix(part) for part in (constraint.modes, constraint.offset[:, None])]
         given = sparse.hstack(both, format="csr")
         coupling = tuple(sparse.csr_matrix(constraint.free.T @ (matrix @ given)) for matrix in self.stiffness)
@@ -124,6 +126,7 @@ class LinearModel:
         # SciPy drops entries that cancel in a sum; an imaginary part keeps them, so that one pattern serves all moduli
         marked = (sparse.csr_matrix((k.data + 1j, k.indices, k.indptr), shape=k.shape) for k in self.free_stiffness)
         matrix = sparse.csr_matrix(weighted_sum(checked, tuple(marked)).real)
+        matrix.data = matrix.data.copy()  # which else are every other number in memory, and keep the others
         return LinearSystem(
             self,
             checked,

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,8 @@ class ReducedModel:
     Per region at 1 kPa: stiffness (n_regions, m, m) and coupling (n_regions, m, n_boundary + 1), mN/mm; load (m,) mN.
     Outputs (rows): output_basis (n_outputs, m), in blocks of columns so that what is added to it copies nothing of what
     is there; output_modes (n_outputs, n_boundary), output_offset (n_outputs,) and
-    output_material (n_outputs, n_material), mm: the responses du/dc_k to the material modes, held as they are.
+    output_material (n_outputs, n_material), mm: the responses du/dc_k to the material modes, held as they are, in
+    single precision where they are of all points and known no better.
     """
 
     names: tuple[str, ...]
@@ -42,7 +44,7 @@ class ReducedModel:
     output_basis: tuple[NDArray[np.float64], ...]
     output_modes: NDArray[np.float64]
     output_offset: NDArray[np.float64]
-    output_material: NDArray[np.float64]
+    output_material: NDArray[np.floating[Any]]
 
     @property
     def n_regions(self) -> int:
@@ -104,7 +106,7 @@ class ReducedModel:
             output_basis=(np.concatenate([seen(block) for block in self.output_basis], axis=1),),
             output_modes=seen(self.output_modes),
             output_offset=seen(self.output_offset),
-            output_material=seen(self.output_material),
+            output_material=seen(self.output_material.astype(np.float64, copy=False)),
         )
 
     def system(self, moduli: NDArray[np.float64]) -> ReducedSystem:
@@ -266,7 +268,18 @@ class Projection:
         )
         return Projection(model, reduced)
 
-    def with_material(self, responses: NDArray[np.float64]) -> Projection:
+    def under(self, model: LinearModel) -> Projection:
+        """The projection of another state of the body, whose modes are the same, on the same vectors in memory."""
+        if model.coupling is self.model.coupling and not np.any(model.free_load - self.model.free_load):
+            return replace(self, model=model)
+        coupling = self.reduced.coupling.copy()
+        for number, matrix in enumerate(model.coupling):
+            coupling[number, :, -1] = self.components(matrix[:, -1:].toarray())[:, 0]
+        load = self.components(model.free_load[:, None])[:, 0]
+        reduced = replace(self.reduced, coupling=coupling, load=load, output_offset=model.constraint.offset)
+        return Projection(model, reduced)
+
+    def with_material(self, responses: NDArray[np.floating[Any]]) -> Projection:
         """The projection with responses du/dc_k (n_dof, n_material) mm to the material modes."""
         return replace(self, reduced=replace(self.reduced, output_material=responses))
 

@@ -15,7 +15,7 @@ from palpate.parallel import mapped, processors
 
 WORTH_THREADS = 3_000_000  # multiplications, above which threads save time
 PART = 2**20  # bytes of a product that is computed at once; the system would fill larger arrays with zeros first
-ROOM = 2**29  # bytes for the vectors of all columns that are iterated together
+ROOM = 2**27  # bytes for the vectors of all columns that are iterated together
 VECTORS = 8  # vectors for each column
 FEWEST = 32  # columns; products of a factor with fewer are slow
 
