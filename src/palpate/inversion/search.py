@@ -29,6 +29,7 @@ NEAR = 1e-3  # decrement of a minimum on linear residuals
 HALVINGS = 5  # of a step that leads to a state which cannot be solved, or to a worse fit
 WORSE = 2.0  # rise of J at which a step is halved: closest points that slide over voxels make less
 FLOOR = 3e-4  # of ln E: a move that is always short enough
+MEMORY, DEPENDENT = 2, 1e-2  # earlier iterations that count; relative size of ways that count as dependent
 FEW = 8  # explanations that are compared while the search is far from its end
 
 
@@ -53,7 +54,7 @@ class Searched:
 
     The evaluation is that under the likeliest explanation. mixture: None before the first iteration. settled: whether
     the noise is fitted, after which the objective stays as it is. moved: by how many of its standard deviations the
-    mean moved last; share: of that way the search goes, less where it went to and fro.
+    mean moved last; led: theta (n_parameters,) of the last iterations, and the mean (n_parameters,) found from each.
     """
 
     objective: Objective
@@ -61,7 +62,7 @@ class Searched:
     mixture: Mixture | None = None
     settled: bool = False
     moved: float = np.inf
-    share: float = 1.0
+    led: tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...] = ()
 
     @property
     def posterior(self) -> Mixture:
@@ -142,27 +143,32 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     objective = objective.believing(objective.parameters.choosing(mixture.explanations[0].chosen))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
-    target = _target(posterior, objective, mixture, near)
     if exact and moved < rule.step_sd:
         evaluation = evaluation.under(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
         return replace(now, objective=objective, minimum=minimum, mixture=mixture, moved=moved)
-    share = _share(now, mixture, theta, sd)
+    led = (*now.led[-MEMORY:], (theta, mixture.mean))
+    target = _target(posterior, objective, mixture, np.clip(_fixed_point(led, sd), near.lower, near.upper))
     settled = now.settled or moved < 1.0
-    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled, share=share)
-    return _taken(before, evaluation, at.unknowns + share * (target - at.unknowns))
+    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled, led=led)
+    return _taken(before, evaluation, target)
 
 
-def _share(now: Searched, mixture: Mixture, theta: NDArray[np.float64], sd: NDArray[np.float64]) -> float:
-    """The share of the way to the mean that the search goes from theta (n_parameters,).
+def _fixed_point(
+    led: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], sd: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Theta (n_parameters,) from which the mean should lead nowhere, by where the last iterations led.
 
-    Half as much as before where the way leads back, in standard deviations (n_parameters,), else twice as much.
+    Anderson's acceleration (Walker & Ni, SIAM J. Numer. Anal. 49 (2011) 1715) in standard deviations (n_parameters,):
+    without it a search goes to and fro where the responses to patchy tissues depend much on the moduli.
     """
-    if len(now.minimum.history) < 2:
-        return now.share
-    last = (theta - now.minimum.history[-2].theta) / sd
-    back = float(last @ ((mixture.mean - theta) / sd)) < 0.0
-    return 0.5 * now.share if back else min(2.0 * now.share, 1.0)
+    places, means = (np.stack(each) / sd for each in zip(*led, strict=True))
+    ways = means - places
+    if len(led) == 1:
+        return np.asarray(means[-1] * sd)
+    by_places, by_ways = np.diff(places, axis=0).T, np.diff(ways, axis=0).T
+    shares = np.linalg.lstsq(by_ways, ways[-1], rcond=DEPENDENT)[0]
+    return np.asarray((means[-1] - (by_places + by_ways) @ shares) * sd)
 
 
 def _fitted(now: Searched, near: Bounds) -> tuple[Objective, Evaluation]:
@@ -183,10 +189,11 @@ def _fitted(now: Searched, near: Bounds) -> tuple[Objective, Evaluation]:
     return objective, objective.weighed(at.unknowns, at.evaluation.linearisations, like)
 
 
-def _target(posterior: Posterior, objective: Objective, mixture: Mixture, near: Bounds) -> NDArray[np.float64]:
-    """Unknowns (n_unknowns,) at the mean of theta, all others at their best under the likeliest explanation."""
+def _target(
+    posterior: Posterior, objective: Objective, mixture: Mixture, theta: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Unknowns (n_unknowns,) at theta (n_parameters,), all others at their best under the likeliest explanation."""
     n = objective.n_parameters
-    theta = np.clip(mixture.mean, near.lower, near.upper)
     start = np.concatenate([theta, mixture.minimum.unknowns[n:]])
     own = posterior.believing(objective.parameters)
     return gauss_newton(own, start, bounds=Bounds(theta, theta), tolerance=NEAR).unknowns

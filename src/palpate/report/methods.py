@@ -63,18 +63,19 @@ def methods_text(data: ReportData) -> Methods:
         _model(data, cite),
         (
             f"The misfit was {observed}. Outliers counted less: by densities with the tails of a power law, on the"
-            f" drivers' walls by Huber's loss {cite('huber')}. The posterior of the logarithms of the moduli was a mixture"
-            " over what may explain the images: how patchy the tissues are, whether layers lie round organs, whether the"
-            " frame of each image moves, and whether its surfaces are drawn alike. Each explanation counted by its evidence"
-            f" in Laplace's approximation {cite('laplace')}, at its own minimum over all other unknowns. Minima were found"
-            f" by Gauss-Newton steps in a trust region {cite('nocedal')} on reduced models {cite('reduced')}, which were"
-            f" made exact at the posterior's mean. {len(data.document['starts'])} starts looked for other minima."
+            f" drivers' walls by Huber's loss {cite('huber')}. The posterior of the moduli's logarithms was a"
+            " mixture over what may explain the images: how patchy the tissues are, whether layers lie round organs,"
+            " whether the frame of each image moves, and whether its surfaces are drawn alike. Each explanation counted"
+            f" by its evidence in Laplace's approximation {cite('laplace')}, at its own minimum over all other unknowns."
+            f" Minima were found by Gauss-Newton steps in a trust region {cite('nocedal')} on reduced models"
+            f" {cite('reduced')}, which were made exact at the posterior's mean. {len(data.document['starts'])} starts"
+            " looked for other minima."
             f"{onwards if law is not None and law.finite else ''}"
         ),
         (
             "Values are medians, and 95 % intervals quantiles, of that mixture. They are wider by spatially correlated"
-            f" residuals (sandwich covariance {cite('white')}), the scatter over the voxel grid's position and a term for"
-            " the mesh"
+            f" residuals (sandwich covariance {cite('white')}), the scatter over the voxel grid's position and a term"
+            " for the mesh"
             f"{leaning}.{covered} The seed of random numbers was {data.document['seed']}."
         ),
     )
