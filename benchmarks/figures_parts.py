@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from figures_text import ROOT, digest
 from mismatch import summary_of
+from patients_rows import figures_of
 from scipy import stats
 
 __all__ = ["PARTS", "Part", "Place", "Run"]
@@ -337,21 +338,11 @@ def pairs_of(results: Sequence[Values]) -> Values:
 
 
 def patients(place: Place) -> Values:
-    """One patient with more and more later images."""
+    """Patients with more and more later images, and the cohort."""
     words = shlex.split(PARTS["patients"].command)[1:]
     out = place.folder / "patients.jsonl"
     run([sys.executable, *words, "--cache", place.folder / "patients", "--output", out])
-    return patients_of(lines_of(out))
-
-
-def patients_of(results: Sequence[Values]) -> Values:
-    """What each number of images costs, and what is stated then."""
-    keys = ("processor_seconds", "peak_gb")
-    rows = {
-        str(row["images"]): {key: row[key] for key in keys} | {"verdicts": [e["verdict"] for e in row["estimates"]]}
-        for row in results
-    }
-    return {"rows": rows}
+    return figures_of(lines_of(kept(place, "patients")))
 
 
 def speed(place: Place) -> Values:
@@ -451,6 +442,6 @@ PARTS = {
     "speed": Part("python benchmarks/speed.py --parts default", 5, speed),
     "verification": Part("palpate verify", 5, verification),
     "pictures": Part("python docs/pictures/draw.py", 3, pictures),
-    "patients": Part("python benchmarks/patients.py --patients 1 --noise 0.3", 25, patients, asked=True),
+    "patients": Part("python benchmarks/patients.py --cohort", 280, patients, asked=True),
     "pairs": Part("python benchmarks/pairs.py --patients 20 --first-seed 701", 300, pairs, asked=True),
 }

@@ -119,7 +119,8 @@ def _shown(figures: Figures, name: str, form: str) -> str:
         view = VIEWS[name]
         of = figures[view.part]
         values = _at(of["values"], view.branch.split(".") if view.branch else [], name)
-        return "\n".join(["", *view.table(values), "", f"*{_source(of, values)}*", ""])
+        source = _source(of, values) if values.get("rows", True) else "Not computed yet."
+        return "\n".join(["", *view.table(values), "", f"*{source}*", ""])
     part, *path = name.split(".")
     value = figures[part][path[0]] if path[0] in ABOUT else _at(figures[part]["values"], path, name)
     if isinstance(value, list):
@@ -245,14 +246,70 @@ def _speed(values: Mapping[str, Any]) -> list[str]:
 
 
 def _patients(values: Mapping[str, Any]) -> list[str]:
-    """What a number of later images of one patient costs."""
-    head = ["later images", "time of one processor", "peak memory", "verdict of prostate, bladder"]
+    """The patients of benchmarks/patients.py, by noise and number of later images."""
+    head = ["surfaces off by", "later images", "patients", "error of ln E (RMS, median)", "half-width (median)"]
+    head += ["stated moduli", "95 % intervals that hold", "time of one processor", "peak memory"]
     lines = [_cells(head), _cells(["---"] * len(head))]
-    for images, row in values["rows"].items():
-        verdicts = [verdict if verdict == "not identified" else f"`{verdict}`" for verdict in row["verdicts"]]
-        words = "both " + verdicts[0] if len(set(verdicts)) == 1 else ", ".join(verdicts)
-        lines.append(_cells([images, f"{row['processor_seconds']:.0f} s", f"{row['peak_gb']:.1f} GB", words]))
+    for row in values["rows"].values():
+        errors = ", ".join(filter(None, (_number(row["rms"]), _number(row["error"]))))
+        cells = [_noise(row), str(row["images"]), str(row["patients"]), errors, _number(row["half_width"])]
+        cells += [_stated(row), _held(row), *_cost(row)]
+        lines.append(_cells(cells))
     return lines
+
+
+def _patients_short(values: Mapping[str, Any]) -> list[str]:
+    """The same for README: what is stated."""
+    head = ["surfaces off by", "later images", "moduli with a stated interval", "of these hold", "median error of ln E"]
+    lines = [_cells(head), _cells(["---"] * len(head))]
+    for row in values["rows"].values():
+        cells = [_noise(row), str(row["images"]), _stated(row), _held(row), _number(row["error"])]
+        lines.append(_cells(cells))
+    return lines
+
+
+def _patients_cost(values: Mapping[str, Any]) -> list[str]:
+    """The same for the page of speed: what a number of later images costs at the largest noise."""
+    most = max((row["noise_mm"] for row in values["rows"].values()), default=0.0)
+    lines = [_cells(["later images", "time of one processor", "peak memory"]), _cells(["---"] * 3)]
+    rows = [row for row in values["rows"].values() if row["noise_mm"] == most]
+    return lines + [_cells([str(row["images"]), *_cost(row)]) for row in rows]
+
+
+def _cohort(values: Mapping[str, Any]) -> list[str]:
+    """The effect of the stage in the cohort of benchmarks/patients.py."""
+    head = ["organ", "patients of the lower, the higher stage", "with a value, with an interval alone"]
+    head += ["factor found", "its 95 % interval", "p", "true factor", "of the moduli that were drawn"]
+    lines = [_cells(head), _cells(["---"] * len(head))]
+    for name, row in values["rows"].items():
+        cells = [name, ", ".join(map(str, row["patients"])), f"{row['stated']}, {row['censored']}"]
+        cells += [_number(row["factor"]), "" if row["undefined"] else _ends(row["interval95"]), _number(row["p"], 3)]
+        lines.append(_cells([*cells, _number(row["truth"]), _number(row["drawn"])]))
+    return lines
+
+
+def _ends(interval: Iterable[float | None]) -> str:
+    """An interval of which an end may be open."""
+    low, high = interval
+    if low is None or high is None:
+        return "open" if low is high else f"below {high:.2f}" if low is None else f"above {low:.2f}"
+    return f"{low:.2f} to {high:.2f}"
+
+
+def _noise(row: Mapping[str, Any]) -> str:
+    law = "" if row["law"] == "linear" else f", {row['law']}"
+    return f"{row['noise_mm']:g} mm{law}"
+
+
+def _stated(row: Mapping[str, Any]) -> str:
+    return f"{row['stated']} of {row['moduli']}"
+
+
+def _cost(row: Mapping[str, Any]) -> list[str]:
+    return [
+        "" if value is None else f"{value:.{digits}f} {unit}"
+        for value, digits, unit in ((row["seconds"], 0, "s"), (row["peak_gb"], 1, "GB"))
+    ]
 
 
 FAMILIES = {  # of `palpate verify`: what each is, and with what it is compared
@@ -295,6 +352,9 @@ VIEWS = {
     "mismatch.noise-table": View("mismatch", "noise", _mismatch),
     "coverage.table": View("coverage", "", _coverage),
     "patients.table": View("patients", "", _patients),
+    "patients.short": View("patients", "", _patients_short),
+    "patients.cost": View("patients", "", _patients_cost),
+    "patients.cohort-table": View("patients", "cohort", _cohort),
     "speed.table": View("speed", "", _speed),
     "verification.table": View("verification", "", _verification),
 }

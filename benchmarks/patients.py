@@ -1,13 +1,19 @@
-"""What more later images of one patient are worth, and what they cost.
+"""Who qualifies: what more later images of one patient are worth, what they cost, and what a cohort tells from them.
 
     python benchmarks/patients.py [--images 1,2,4,8] [--noise 0.15,0.3] [--laws linear] [--patients 4]
+                                  [--cohort [8]] [--cohort-images 6] [--cohort-noise 0.3]
                                   [--first-seed 901] [--cache FOLDER] [--output FILE]
+    python benchmarks/patients.py --summary [--output FILE]      # no run: tables of the lines that are there
 
 Simulated patients, everything at once: one body, of which every later image shows another filling of the rectum (5 to
 8 mm), a border that moves smoothly by 1 mm, a patient who lies 3 mm and 2 degrees elsewhere, and surfaces with errors
 of their own (correlated over 6 mm); ln E varies by 0.3 (25 mm) in every tissue; voxels of 1 x 1 x 2 mm. The same images
 serve every number of images. Each estimate runs in a process of its own, with default settings. One line of JSON an
 estimate: moduli, truths, intervals, verdicts, seconds of processor and wall, peak memory.
+
+--cohort adds such patients, half of a lower and half of a higher stage (by turns), one joint estimate each. Prostates
+of the higher stage are stiffer by a factor of 1.3; the moduli of all patients scatter by 0.2 in ln E. The effect of the
+stage is that of `palpate statistics`. `--patients 0 --cohort` runs nothing else.
 """
 
 from __future__ import annotations
@@ -19,12 +25,15 @@ import resource
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from figures_text import VIEWS
 from numpy.typing import NDArray
+from patients_rows import EFFECT, figures_of
 
 import palpate
 from palpate.images import write_label_image
@@ -52,6 +61,35 @@ SPACING_MM, FIELD_MM, TRUTH_EDGE_MM = (1.0, 1.0, 2.0), (140.0, 146.0, 146.0), 3.
 FILLING_MM, BORDER_MM, BORDER_LENGTH_MM = (5.0, 8.0), 1.0, 60.0
 SHIFT_MM, SHIFT_DEG = 3.0, 2.0
 FIELD_SD, FIELD_LENGTH_MM, NOISE_LENGTH_MM = 0.3, 25.0, 6.0
+LOWER_KPA, SCATTER = {"prostate": 25.0, "bladder": 30.0}, 0.2  # of the cohort: of the lower stage; sd of ln E
+SHOWN = ("tissue", "value", "interval95", "verdict", "truth")
+KEPT = (*SHOWN, "parameter", "unit", "ratio", "ratio_interval95", "variance_shares", "profile")  # as statistics read it
+
+
+class Patient(NamedTuple):
+    """A simulated patient; stage: 0 or 1 in the cohort, None: a patient with the moduli of the seed."""
+
+    seed: int
+    law: str
+    noise_mm: float
+    stage: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Of the folder."""
+        of_stage = "" if self.stage is None else f"-stage{self.stage}"
+        return f"patient-{self.seed}-{self.law}-{self.noise_mm:g}mm{of_stage}"
+
+    @property
+    def moduli_kpa(self) -> dict[str, float] | None:
+        """The moduli of a patient of the cohort: of its stage, scattered by the seed."""
+        if self.stage is None:
+            return None
+        scatter = SCATTER * np.random.default_rng([self.seed, 90]).normal(size=len(ORGANS))
+        return {
+            organ: LOWER_KPA[organ] * EFFECT[organ] ** self.stage * float(np.exp(away))
+            for organ, away in zip(ORGANS, scatter, strict=True)
+        }
 
 
 def main() -> int:
@@ -62,27 +100,54 @@ def main() -> int:
     parser.add_argument("--laws", default="linear")
     parser.add_argument("--patients", type=int, default=4)
     parser.add_argument("--first-seed", type=int, default=901)
+    parser.add_argument("--cohort", type=int, nargs="?", const=8, default=0, help="patients of the cohort")
+    parser.add_argument("--cohort-images", type=int, default=6, help="later images of each of them")
+    parser.add_argument("--cohort-noise", type=float, default=0.3, help="their surfaces' errors, mm")
     parser.add_argument("--cache", type=Path, default=Path("patients"))
     parser.add_argument("--output", type=Path, default=Path("patients.jsonl"))
+    parser.add_argument("--summary", action="store_true", help="run nothing: tables of the lines in the output")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.one:
         print(json.dumps(_estimated(Path(asked.one))))
         return 0
     rows = [json.loads(line) for line in asked.output.read_text().splitlines()] if asked.output.exists() else []
-    done = {(row["seed"], row["law"], row["noise_mm"], row["images"]) for row in rows}
+    if asked.summary:
+        print("\n".join(_summary(rows)))
+        return 0
+    wanted = list(_wanted(asked))
+    if wrong := sorted({n for _, n in wanted if not 0 < n <= MOST}):
+        parser.error(f"{wrong} later images: a patient has 1 to {MOST}")
+    done = {(row["seed"], row["law"], row["noise_mm"], row.get("stage"), row["images"]) for row in rows}
+    for patient, n in wanted:
+        if (*patient, n) in done:
+            continue
+        row = {**patient._asdict(), "images": n, **_run(_case(patient_folder(patient, asked.cache), n))}
+        with asked.output.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        print(json.dumps(row), file=sys.stderr, flush=True)
+    return 0
+
+
+def _wanted(asked: argparse.Namespace) -> Iterator[tuple[Patient, int]]:
+    """Each patient that is asked for, with a number of later images; the cohort comes last, its stages by turns."""
     for seed in range(asked.first_seed, asked.first_seed + asked.patients):
         for law in asked.laws.split(","):
             for noise in map(float, asked.noise.split(",")):
                 for n in map(int, asked.images.split(",")):
-                    if (seed, law, noise, n) in done:
-                        continue
-                    folder = patient_folder(seed, law, noise, asked.cache)
-                    row = {"seed": seed, "law": law, "noise_mm": noise, "images": n, **_run(_case(folder, n))}
-                    with asked.output.open("a") as file:
-                        file.write(json.dumps(row) + "\n")
-                    print(json.dumps(row), file=sys.stderr, flush=True)
-    return 0
+                    yield Patient(seed, law, noise), n
+    for k in range(asked.cohort):
+        for law in asked.laws.split(","):
+            yield Patient(asked.first_seed + k, law, asked.cohort_noise, k % 2), asked.cohort_images
+
+
+def _summary(rows: list[dict[str, Any]]) -> list[str]:
+    """Both tables, as the pages have them."""
+    found = figures_of(rows)
+    lines = [*VIEWS["patients.table"].table(found), "", *VIEWS["patients.cohort-table"].table(found["cohort"])]
+    undefined = {name: row["undefined"] for name, row in found["cohort"]["rows"].items() if row["undefined"]}
+    failed = [f"{name}: {row['failed']} failed" for name, row in found["rows"].items() if row["failed"]]
+    return lines + [f"{name}: {words}" for name, words in undefined.items()] + failed
 
 
 def _run(case: Path) -> dict[str, Any]:
@@ -99,14 +164,13 @@ def _estimated(path: Path) -> dict[str, Any]:
     began, truth = time.perf_counter(), json.loads((path.parent / "truth.json").read_text())["moduli_kpa"]
     document = palpate.estimate(palpate.read_case(path), truth=truth).to_dict()
     spent = resource.getrusage(resource.RUSAGE_SELF)
-    kept = ("tissue", "value", "interval95", "verdict", "truth")
     return {
         "status": document["status"],
         "reason": document["reason"],
-        "estimates": [{key: item[key] for key in kept} for item in document["estimates"]],
+        "estimates": [{key: item[key] for key in KEPT} for item in document["estimates"]],
         "seconds": round(time.perf_counter() - began, 1),
         "processor_seconds": round(spent.ru_utime + spent.ru_stime, 1),
-        "peak_gb": round(spent.ru_maxrss / 2**20, 2),
+        "peak_gb": round(spent.ru_maxrss * 1024 / 1e9, 2),
         "warnings": sorted({warning["code"] for warning in document["warnings"]}),
     }
 
@@ -123,13 +187,15 @@ def _case(folder: Path, n: int) -> Path:
     return path
 
 
-def patient_folder(seed: int, law: str, noise_mm: float, cache: Path) -> Path:
+def patient_folder(patient: Patient, cache: Path) -> Path:
     """The folder of a patient in `cache`, made if it is not there: before, eight later images, truth.json."""
-    folder = cache / f"patient-{seed}-{law}-{noise_mm:g}mm"
+    folder = cache / patient.name
     if (folder / "truth.json").exists():
         return folder
+    seed, law, noise_mm, stage = patient
     rng = np.random.default_rng([seed, 89])
     options = PelvisOptions(seed, field_mm=FIELD_MM, truth_edge_mm=TRUTH_EDGE_MM, spacing_mm=SPACING_MM, law=law)
+    options = replace(options, moduli_kpa=patient.moduli_kpa)
     space = lagrange_space(tetrahedralise(pelvis_anatomy(options), edge_length_mm=TRUTH_EDGE_MM), "P2")
     motions = [_motion(options, number, space, rng) for number in range(1, MOST + 1)]
     patchy = patched(space.mesh, _patches(space, rng))
@@ -152,8 +218,8 @@ def patient_folder(seed: int, law: str, noise_mm: float, cache: Path) -> Path:
         tissues[tissue.name] |= {"poisson_ratio": tissue.poisson_ratio} if tissue.meshed else {}
         tissues[tissue.name] |= {"youngs_modulus_kpa": tissue.youngs_modulus_kpa} if known else {}
     moduli = {t.name: t.youngs_modulus_kpa for t in space.mesh.tissues if t.name in ORGANS}
-    truth = {"simulated": True, "seed": seed, "law": law, "noise_mm": noise_mm, "moduli_kpa": moduli}
-    (made / "truth.json").write_text(json.dumps({**truth, "tissues": tissues}, indent=1))
+    truth = {"simulated": True, "seed": seed, "law": law, "noise_mm": noise_mm, "stage": stage}
+    (made / "truth.json").write_text(json.dumps({**truth, "moduli_kpa": moduli, "tissues": tissues}, indent=1))
     made.rename(folder)
     return folder
 

@@ -83,7 +83,7 @@ def records_of(plan: Plan, folder: Path) -> tuple[Record, ...]:
             document = read_json(place / RESULT)
         except InputDataError:  # the file that the mark vouches for is gone
             return Record(row, "waiting")
-        moduli = tuple(_modulus(item) for item in document["estimates"] if item["parameter"] == "youngs_modulus")
+        moduli = tuple(modulus_of(item) for item in document["estimates"] if item["parameter"] == "youngs_modulus")
         codes = tuple(dict.fromkeys(warning["code"] for warning in document.get("warnings", ())))
         inputs = document.get("inputs", {})
         keys = [key for key in inputs if key not in NOT_IMAGES and f"{key}.voxels" not in inputs]
@@ -98,7 +98,7 @@ def tissues_of(records: Sequence[Record]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(modulus.tissue for record in records for modulus in record.moduli))
 
 
-def _modulus(item: Mapping[str, Any]) -> Modulus:
+def modulus_of(item: Mapping[str, Any]) -> Modulus:
     """That of an entry of `estimates`: the ratio where its scale is a range, which all scans would err by together.
 
     Where no interval is stated, its ends are those of the profile [value, signed root deviance], where that meets -1.96
