@@ -118,7 +118,7 @@ def mixture_of(
             found.append(each)
     found.sort(key=lambda each: -each.level)
     weights = np.exp([each.level - found[0].level for each in found])
-    weights /= weights.sum()
+    weights = weights[weights > 0.0] / weights.sum()
     explanations = [
         Explanation(
             dict(each.of.chosen),
@@ -128,7 +128,7 @@ def mixture_of(
             each.minimum.unknowns[:n],
             each.minimum.evaluation.covariance_columns(n)[:n],
         )
-        for each, weight in zip(found, weights, strict=True)
+        for each, weight in zip(found, weights, strict=False)
     ]
     return Mixture(tuple(explanations), found[0].minimum)
 
