@@ -90,6 +90,19 @@ def approximated(body):
 
 
 @dataclass(frozen=True)
+class Whole:
+    """A body itself in the place of an approximation."""
+
+    model: Response
+    counts: SolveCounts = field(default_factory=SolveCounts)
+    trust_radius: float = np.inf
+
+    def update(self, _at, others=()):
+        del others
+        return self
+
+
+@dataclass(frozen=True)
 class Readings:
     """Numbers `seen` (n,) mm of an organ, outputs `dofs` (n,) with independent errors, an `Observation`.
 
@@ -186,8 +199,11 @@ class Patient:
     parameters: ParameterMap
     truth: np.ndarray
 
-    def problem(self, rng=None, *, seen=None, bounds=(SD, SD), scale=1.0) -> InverseProblem:
-        """What readings tell: of the truth, with errors of `scale` SD drawn by `rng` where it is given, or as `seen`."""
+    def problem(self, rng=None, *, bounds=(SD, SD), scale=1.0, whole=False) -> InverseProblem:
+        """What readings tell of the truth, with errors of `scale` SD drawn by `rng` where it is given.
+
+        whole: whether each body stands for itself, else what it is to first order.
+        """
         states = []
         for s, body in enumerate(self.bodies):
             unknowns, n = self.truth, len(body.slopes)
@@ -195,10 +211,10 @@ class Patient:
             offsets = dict(zip(self.parameters.offset_names(s), self.parameters.offsets(unknowns, s), strict=True))
             values = values + np.repeat([offsets.get(of, 0.0) for of in ORGANS], N_READ)
             values = values if rng is None else values + scale * SD * rng.standard_normal(n)
-            values = values if seen is None else seen[s]
             parts = np.split(np.arange(n), len(ORGANS))
             own = [readings(of, dofs, values[dofs], bounds=bounds) for of, dofs in zip(ORGANS, parts, strict=True)]
-            states.append(LaterState(body, tuple(own)).with_approximation(approximated(body)))
+            model = Whole(body) if whole else approximated(body)
+            states.append(LaterState(body, tuple(own)).with_approximation(model))
         return InverseProblem(tuple(states), self.parameters)
 
     def objective(self, *args, **named) -> Objective:
@@ -265,6 +281,33 @@ def with_unknowns(of: Patient, block, values) -> Patient:
     return replace(of, truth=truth)
 
 
+def in_unit(of: Patient, unit) -> Patient:
+    """The same, all that is read in another unit, by `unit` times larger numbers."""
+    own = of.parameters
+    blocks = [
+        replace(block, alternatives=tuple(replace(a, covariance=unit**2 * a.covariance) for a in block.alternatives))
+        if block.acts is Acts.RESIDUALS
+        else block
+        for block in own.blocks
+    ]
+    parameters = replace(own, blocks=tuple(blocks), nuisance_precision=np.zeros((0, 0)))
+    bodies = tuple(Response(unit * b.slopes, unit * b.bends, b.n_boundary) for b in of.bodies)
+    truth = of.truth.copy()
+    for s in range(own.n_states):
+        truth[own.acting(Acts.RESIDUALS, s)] *= unit
+    return Patient(bodies, parameters, truth)
+
+
+def reordered(problem: InverseProblem, order) -> InverseProblem:
+    """The same later images in another order."""
+    own = problem.parameters
+    alone = {block.states: [b for b in own.blocks if b.states == block.states] for block in own.blocks}
+    tissues = [block for block in own.blocks if len(block.states) > 1]
+    images = [replace(block, states=(new,)) for new, old in enumerate(order) for block in alone[(old,)]]
+    parameters = replace(own, blocks=(*tissues, *images), nuisance_precision=np.zeros((0, 0)))
+    return InverseProblem(tuple(problem.states[old] for old in order), parameters)
+
+
 def every_explanation(parameters):
     """All explanations: choices by block with their log prior odds, every combination of those of several images."""
     images = [alternatives_of(parameters.blocks, s) for s in range(parameters.n_states)]
@@ -272,7 +315,7 @@ def every_explanation(parameters):
         yield tuple(pair for of in parts for pair in of.chosen), sum(of.log_odds for of in parts)
 
 
-def dense_evidence(of: Patient, seen, chosen, *, theta, theta_sd) -> float:
+def dense_evidence(of: Patient, seen, chosen, *, theta=np.zeros(2), theta_sd=1e3) -> float:
     """Ln N(seen; D m, s^2 1 + D C D^T) of all readings, ln E normal around theta by theta_sd; by whole matrices."""
     parameters, design = of.parameters, of.design()
     choices = dict(chosen)

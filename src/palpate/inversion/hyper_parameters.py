@@ -156,7 +156,7 @@ def evident_variances(
 
     information A (n, n) = R^T R and pull b = R^T t (n,) are what data say. With D_t = R C_t R^T and K = sum_t v_t D_t,
     v_t <- v_t (w^T D_t w / tr((1 + K)^-1 D_t))^(1/2), w = (1 + K)^-1 t: every sweep raises the evidence (Zhou, Hu, Zhou
-    & Lange, J. Comput. Graph. Stat. 28 (2019) 350).
+    & Lange, J. Comput. Graph. Stat. 28 (2019) 350). A term that moves nothing seen keeps 1, with which it begins.
     """
     sizes, vectors = linalg.eigh(information, check_finite=False)
     kept = sizes > len(sizes) * np.finfo(np.float64).eps * sizes[-1]
@@ -172,8 +172,9 @@ def evident_variances(
         inverse = np.linalg.inv(np.eye(len(target)) + np.tensordot(variances, seen, axes=1))
         at_best = inverse @ target
         explained = np.einsum("i,tij,j->t", at_best, seen, at_best, optimize=True)
-        expected = np.maximum(np.einsum("tij,ij->t", seen, inverse), np.finfo(np.float64).tiny)
-        before, variances = variances, np.clip(variances * np.sqrt(explained / expected), low, high)
+        expected = np.einsum("tij,ij->t", seen, inverse)
+        ratios = np.divide(explained, expected, out=np.ones(len(terms)), where=expected > np.finfo(np.float64).eps)
+        before, variances = variances, np.clip(variances * np.sqrt(ratios), low, high)
         if np.all(np.abs(variances - before) < SETTLED * before):
             break
     return variances

@@ -28,7 +28,7 @@ SEEN = 6.0  # of the log-evidence: explanations that are less likely than the be
 MOST = 40  # explanations whose minimum is sought on the model, of all later images together
 FEWEST = 6  # the same, however many later images there are
 ROUNDS = 4  # over all images, to find the likeliest alternatives of each
-MINIMUM = 1e-2  # decrement at which the minimum of an explanation ends
+MINIMUM = 1e-3  # decrement at which the minimum of an explanation ends: 0.045 sd from it, as a search does
 
 
 @dataclass(frozen=True, slots=True)
