@@ -9,8 +9,15 @@ from types import SimpleNamespace
 import numpy as np
 from scipy import linalg, sparse
 
-from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, Objective, alternatives_of
-from palpate.inversion import scenarios_of
+from palpate.inversion import (
+    Bounds,
+    InverseProblem,
+    InversionSettings,
+    LaterState,
+    Objective,
+    alternatives_of,
+    scenarios_of,
+)
 from palpate.mechanics.first_order import FirstOrderModel, expanded
 from palpate.mechanics.forward import DenseEquilibrium, SolveCounts
 from palpate.observation.contract import Residuals, Weighting
@@ -175,7 +182,10 @@ def blocks_of(n_images, *, odds=0.0, seldom=-3.0, unit=1.0):
         Alternative(sd**2 * eye, odd, name)
         for sd, odd, name in ((0.02, 0.0, "still"), (0.2, -0.7, "hardly moves"), (1.5, -0.7, "moves"))
     )
-    drawn = Alternative(np.full((1, 1), 0.01**2), 0.0, "alike"), Alternative(np.full((1, 1), 0.4**2), seldom, "otherwise")
+    drawn = (
+        Alternative(np.full((1, 1), 0.01**2), 0.0, "alike"),
+        Alternative(np.full((1, 1), 0.4**2), seldom, "otherwise"),
+    )
     fields = [Block(of, "heterogeneity", Acts.MATERIAL, every, levels, Choice.PATCHINESS) for of in ORGANS]
     films = [
         Block(of, "layer", Acts.MODULI, every, layers, Choice.LAYERS, regions=(2 + i,)) for i, of in enumerate(ORGANS)
@@ -260,9 +270,7 @@ def patient(rng, n_images=1, *, bend=0.0, gain=(1.0, 1.0), **beliefs) -> Patient
 def without(of: Patient, dropped) -> Patient:
     """The same without what the blocks that are `dropped`, by their numbers, stand for."""
     parameters, kept = of.parameters, [i for i in range(len(of.parameters.blocks)) if i not in dropped]
-    fewer = replace(
-        parameters, blocks=tuple(parameters.blocks[i] for i in kept), nuisance_precision=np.zeros((0, 0))
-    )
+    fewer = replace(parameters, blocks=tuple(parameters.blocks[i] for i in kept), nuisance_precision=np.zeros((0, 0)))
     bodies = []
     for s, body in enumerate(of.bodies):
         groups = [parameters.acting(acts, s) for acts in (Acts.BOUNDARY, Acts.MATERIAL)]
@@ -315,14 +323,14 @@ def every_explanation(parameters):
         yield tuple(pair for of in parts for pair in of.chosen), sum(of.log_odds for of in parts)
 
 
-def dense_evidence(of: Patient, seen, chosen, *, theta=np.zeros(2), theta_sd=1e3) -> float:
+def dense_evidence(of: Patient, seen, chosen, *, theta=(0.0, 0.0), theta_sd=1e3) -> float:
     """Ln N(seen; D m, s^2 1 + D C D^T) of all readings, ln E normal around theta by theta_sd; by whole matrices."""
     parameters, design = of.parameters, of.design()
     choices = dict(chosen)
     covariances = [b.alternatives[choices.get(i, b.first)].covariance for i, b in enumerate(parameters.blocks)]
     covariance = linalg.block_diag(theta_sd**2 * np.eye(2), *covariances)
     total = SD**2 * np.eye(len(design)) + design @ covariance @ design.T
-    away = np.concatenate(seen) - design[:, :2] @ theta
+    away = np.concatenate(seen) - design[:, :2] @ np.asarray(theta)
     return float(-0.5 * (away @ np.linalg.solve(total, away) + np.linalg.slogdet(total)[1]))
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from scipy import optimize
 
 from palpate.inversion import LinearisedObjective, begun, gauss_newton, with_correlations, with_first_noise, with_scales

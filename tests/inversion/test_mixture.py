@@ -180,7 +180,9 @@ def test_what_made_the_readings_gets_most_weight(patients, cause, seed):
     assert first.weight > 0.4
 
 
-@pytest.mark.parametrize("dropped", [(4,), (5, 6), (4, 5, 6), (0, 1), (2, 3), (0, 1, 2, 3), (0, 1, 2, 3, 4, 5)], ids=str)
+@pytest.mark.parametrize(
+    "dropped", [(4,), (5, 6), (4, 5, 6), (0, 1), (2, 3), (0, 1, 2, 3), (0, 1, 2, 3, 4, 5)], ids=str
+)
 def test_choices_that_a_problem_lacks_are_none(patients, dropped):
     rng = np.random.default_rng(2)
     of = patients.without(patients.patient(rng), dropped)

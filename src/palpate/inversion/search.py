@@ -114,8 +114,8 @@ def searched(
 ) -> Searched:
     """The search followed from where it has `begun` until the posterior's mean moves no more by the `rule`.
 
-    While a step is longer than a standard deviation the noise is fitted anew; with the first shorter one it stays, and
-    so does the objective. begins (n_unknowns,) each: where further minima are sought. A search that does not end by its
+    The noise is fitted anew until a step was no longer than a standard deviation, and once more where that led: fitted
+    further away, it has correlations of what is still motion. Then it stays, and so does the objective. begins (n_unknowns,) each: where further minima are sought. A search that does not end by its
     rule says so in its minimum's outcome. Raises `EstimationError`s of models that cannot be solved.
     """
     now = begin
@@ -135,7 +135,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     near = Bounds(np.maximum(bounds.lower, theta - radius), np.minimum(bounds.upper, theta + radius))
     objective, evaluation = _fitted(now, near)
     posterior = cheapest_posterior(objective, at.unknowns, evaluation)
-    exact = now.settled and now.moved < 1.0
+    exact = now.moved < 1.0
     few = {} if exact else {"most": FEW}
     mixture = mixture_of(posterior, at.unknowns, evaluation, bounds if exact else near, begins=begins, **few)
     objective = objective.believing(objective.parameters.choosing(mixture.explanations[0].chosen))
@@ -145,8 +145,8 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     if exact and moved < rule.step_sd:
         evaluation = evaluation.under(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
-        return replace(now, objective=objective, minimum=minimum, mixture=mixture, moved=moved)
-    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=now.settled or moved < 1.0)
+        return replace(now, objective=objective, minimum=minimum, mixture=mixture, moved=moved, settled=True)
+    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=now.settled or exact)
     return _taken(before, evaluation, target)
 
 
