@@ -26,7 +26,6 @@ from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_mod
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.laws.registry import law_named
 from palpate.mechanics.linear_model import LinearModel
-from palpate.mechanics.solvers.registry import CheckedFactorisation
 
 MEMBERS = [name for name in vars(Approximation) if not name.startswith("_")]
 
@@ -188,16 +187,35 @@ def test_what_it_cost_grows_with_an_update_and_not_where_it_is_exact_already(mad
     assert made.trust_radius > 0.0
 
 
-def test_what_its_error_costs_is_stated(made, there, monkeypatch):
+@dataclass(frozen=True)
+class Asked:
+    """Another factorisation, which writes down how many right-hand sides it is asked for."""
+
+    of: object
+    asked: list[int]
+
+    def solve(self, rhs, **named):
+        self.asked.append(rhs.shape[1])
+        return self.of.solve(rhs, **named)
+
+    def __getattr__(self, name):
+        return getattr(self.of, name)
+
+
+def watched(of, asked):
+    """The same with every factorisation in it one that writes down what it is asked for."""
+    changes, own = {}, {member.name for member in fields(of)}
+    for name in own & {"factorisation", "system", "equilibrium", "path"}:
+        value = getattr(of, name)
+        changes[name] = Asked(value, asked) if name == "factorisation" else watched(value, asked)
+    return replace(of, **changes)
+
+
+def test_what_its_error_costs_is_stated(made, there):
     """Right-hand sides with the factorisation that is there; no approximation solves the model anew to be checked."""
-    asked, solve = [], CheckedFactorisation.solve
-
-    def counted(self, rhs, **kwargs):
-        asked.append(rhs.shape[1])
-        return solve(self, rhs, **kwargs)
-
-    monkeypatch.setattr(CheckedFactorisation, "solve", counted)
-    made.error(there)
+    asked = list[int]()
+    watched(made, asked).error(there)
+    assert asked
     assert made.error_counts == SolveCounts(forward=sum(asked))
 
 

@@ -13,6 +13,7 @@ from scipy import linalg
 from palpate.inversion import LaterState, Objective, hyper_parameters
 from palpate.observation.wall_modes import Wall, fine_modes, wall_modes, wall_of
 from palpate.unknowns import Acts, Block, ParameterMap, unit_blocks, wall_blocks
+from palpate.unknowns.blocks import only
 
 N_MODES = 90
 
@@ -167,7 +168,7 @@ def test_what_is_not_seen_at_all_keeps_a_bounded_prior():
 def test_where_nothing_is_seen_the_evidence_asks_for_nothing(n_terms, capfd):
     """A block's prior is then as it begins, and no library complains."""
     terms = tuple(np.diag([1.0, 2.0, 0.5]) ** (k + 1) for k in range(n_terms))
-    block = Block("b", "driver", Acts.BOUNDARY, (0,), np.eye(3), (terms,))
+    block = Block("b", "driver", Acts.BOUNDARY, (0,), only(np.eye(3)), terms=terms)
     given = Objective((LaterState(None, ()),), ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, (block,)))
     evaluation = SimpleNamespace(matrix=np.eye(3), prior=np.eye(3), score=np.zeros(3), prior_score=np.zeros(3))
     found = hyper_parameters.with_amplitudes(given, evaluation, np.zeros(3))
@@ -195,7 +196,7 @@ def test_what_is_believed_of_the_others_follows_their_prior_mean_too(rng):
     parameters = ParameterMap(
         np.ones(2), np.eye(2), ("a", "b"), "c", True, (), prior_mean=mean, prior_precision=precision
     )
-    block = Block("b", "driver", Acts.BOUNDARY, (0,), np.eye(k), ((term,),), amplitudes=(1e-3, 1e3))
+    block = Block("b", "driver", Acts.BOUNDARY, (0,), only(np.eye(k)), terms=(term,))
     parameters = replace(parameters, blocks=(block,), nuisance_precision=np.eye(k))
     prior, data = parameters.prior_matrix, design.T @ design
     x = rng.normal(size=n)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from functools import cache
 
 import numpy as np
 import pytest
 
 from palpate.approximation import expansion
 from palpate.errors import EstimationError, NotConverged, SolverError
-from palpate.inversion import Candidate, Outcome, concluded, continuation, invert
-from palpate.inversion.trust_region import NEAR, REPORTED
+from palpate.inversion import REPORTED, begun, invert, searched
+from palpate.inversion.estimate import at_finite_strain
+from palpate.inversion.search import ROUGH
 from palpate.mechanics.finite_strain import FiniteStrainModel, finite_strain_model
 from palpate.mechanics.laws.registry import law_named
 from palpate.progress import silent
@@ -39,23 +39,12 @@ def settings(twins):
 @pytest.fixture(scope="module")
 def linear(twins, body, settings):
     """What the finite-strain law is begun from."""
-    _, problem, model = body
-    found = invert(problem.linear(), settings, progress=twins.silent, rule=NEAR)
-    candidates = [replace(candidate, iterate=under(model, candidate.iterate)) for candidate in found.candidates]
-    return replace(found, candidates=tuple(candidates))
+    return invert(body[1].linear(), settings, progress=twins.silent, rule=ROUGH)
 
 
-def followed(linear, bounds, progress=silent):
-    """What comes of linear minima."""
-    minima = [candidate.iterate for candidate in linear.candidates]
-    ends = continuation.continued(minima, bounds, rule=REPORTED, progress=progress)
-    return concluded(ends, linear.starts, linear.rest, bounds)
-
-
-def under(model, iterate):
-    """A linear minimum whose state has that finite-strain model."""
-    states = tuple(replace(state, finite_strain=model) for state in iterate.objective.states)
-    return replace(iterate, objective=replace(iterate.objective, states=states))
+@pytest.fixture(scope="module")
+def continued(twins, body, settings):
+    return invert(body[1], settings, progress=twins.silent)
 
 
 def failing(model, error):
@@ -70,26 +59,6 @@ def failing(model, error):
     return Failing(*(getattr(model, field.name) for field in fields(model)))
 
 
-@pytest.fixture(scope="module")
-def ended(linear, settings):
-    """The estimate where all derivatives are made those of each equilibrium up to so many of them."""
-
-    @cache
-    def with_few(few):
-        with pytest.MonkeyPatch.context() as patch:
-            around = continuation.expansion_around
-            patch.setattr(continuation, "expansion_around", lambda *of, **named: replace(around(*of, **named), few=few))
-            return followed(linear, settings.bounds)
-
-    return with_few
-
-
-@pytest.fixture(scope="module", params=[0, 1000], ids=["those that decide", "all"])
-def continued(request, ended):
-    """With the derivatives that decide the moduli made those of each equilibrium, or all of them."""
-    return ended(request.param)
-
-
 def split(inversion):
     """Moduli and coefficients of the estimate, and its approximation."""
     unknowns, parameters = inversion.minimum.unknowns, inversion.objective.parameters
@@ -99,28 +68,36 @@ def split(inversion):
 def test_the_law_that_made_the_data_finds_the_moduli(twins, linear, continued):
     assert np.abs(linear.minimum.unknowns[:2] - twins.TRUTH).max() > 0.03  # or there would be nothing to show
     assert continued.minimum.converged
-    assert continued.convergence.converged
     assert np.abs(continued.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
 
 
-def test_the_derivatives_that_decide_the_moduli_are_those_of_the_equilibrium(body, continued):
+@pytest.fixture(scope="module", params=[0, expansion.FEW], ids=["those that decide", "all"])
+def ended(request, twins, settings, continued):
+    """Where a search goes on to whose derivatives are made exact: up to so many of them all."""
+    (approximation,) = continued.objective.approximations
+    start = begun(continued.objective.under([replace(approximation, few=request.param)]), continued.minimum.unknowns)
+    return searched(start, settings.bounds, REPORTED, progress=twins.silent, title="")
+
+
+def test_the_derivatives_that_decide_the_moduli_are_those_of_the_equilibrium(twins, body, ended):
     """The other columns may be those of an earlier one."""
-    moduli, q, approximation = split(continued)
-    there = body[2].solve(moduli, q)
-    directions = continued.objective.linearisation_points(continued.minimum.unknowns, continued.minimum.evaluation)[
-        0
-    ].directions
-    exact, stated = there.tangent() @ directions, approximation.model.derivatives @ directions
+    end = ended
+    assert end.minimum.converged
+    assert np.abs(end.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
+    moduli, q, approximation = split(end)
+    (point,) = end.objective.linearisation_points(end.minimum.unknowns, [end.minimum.evaluation])
+    exact = body[2].solve(moduli, q).tangent() @ point.directions
+    stated = approximation.model.derivatives @ point.directions
     assert np.linalg.norm(stated - exact, axis=0) == pytest.approx(0.0, abs=0.02 * np.linalg.norm(exact))
 
 
-def test_all_derivatives_are_those_of_the_equilibrium_where_they_are_few(ended):
+def test_all_derivatives_are_those_of_the_equilibrium_where_they_are_few(continued):
     """By the directions that decide alone columns of elsewhere remain."""
-    found, missed = ended(0), []
+    found, missed = continued, []
     unknowns = found.minimum.unknowns + np.array([0.3, -0.2, *np.full(len(found.minimum.unknowns) - 2, 0.1)])
     evaluation = found.objective(unknowns)
     for few in (0, expansion.FEW):
-        (place,) = found.objective.linearisation_points(unknowns, evaluation)
+        (place,) = found.objective.linearisation_points(unknowns, [evaluation])
         there = replace(found.objective.states[0].approximation, few=few).update(place)
         exact = there.equilibrium.tangent()
         missed.append(np.linalg.norm(there.model.derivatives - exact) / np.linalg.norm(exact))
@@ -134,17 +111,18 @@ def test_the_displacement_reported_is_an_equilibrium(body, continued):
     assert stated == pytest.approx(body[2].solve(moduli, q).displacement, abs=1e-5)
 
 
-def test_every_start_keeps_the_steps_and_the_verdict_that_it_had_under_the_linear_law(linear, continued):
+def test_starts_are_those_of_the_linear_law(linear, continued):
     for before, after in zip(linear.starts, continued.starts, strict=True):
-        assert after.minimum.history == before.minimum.history
-        assert after.minimum.outcome is before.minimum.outcome
         assert np.array_equal(after.theta, before.theta)
+        assert after.minimum.outcome is before.minimum.outcome
+        assert np.array_equal(after.minimum.unknowns, before.minimum.unknowns)
 
 
 def test_the_steps_that_the_starts_share_are_those_of_both_laws_and_lead_to_the_estimate(linear, continued):
     history = continued.minimum.history
     assert len(history) > len(linear.minimum.history) > 0
-    assert history[: len(linear.minimum.history)] == linear.minimum.history
+    thetas = [[tuple(iterate.theta) for iterate in found.minimum.history] for found in (linear, continued)]
+    assert thetas[1][: len(thetas[0])] == thetas[0]
     assert np.abs(history[-1].theta - continued.minimum.unknowns[:2]).max() < 1e-3
 
 
@@ -154,48 +132,25 @@ def test_what_both_laws_cost_is_counted(linear, continued):
     assert continued.evaluations > linear.evaluations
 
 
-def test_a_motion_without_equilibrium_ends_the_estimate_where_it_is_the_best_one(body, linear, settings):
-    best = linear.candidates[linear.best]
-    lost = replace(best, iterate=under(failing(body[2], NotConverged("folded")), best.iterate))
-    with pytest.raises(NotConverged, match="folded"):
-        followed(replace(linear, candidates=(lost,)), settings.bounds)
+@pytest.mark.parametrize(
+    "error", [NotConverged("folded"), SolverError("singular"), EstimationError("nothing left")], ids=str
+)
+def test_a_motion_without_equilibrium_ends_the_estimate_and_says_why(twins, body, settings, error):
+    _, problem, model = body
+    states = tuple(replace(state, finite_strain=failing(model, error)) for state in problem.states)
+    with pytest.raises(type(error), match=str(error)):
+        invert(replace(problem, states=states), settings, progress=twins.silent)
 
 
-FAILURES = {
-    NotConverged("folded"): Outcome.NO_EQUILIBRIUM,
-    SolverError("singular"): Outcome.NOT_FOLLOWED,
-    EstimationError("nothing left to compare"): Outcome.NOT_FOLLOWED,
-}
-
-
-def test_secondary_minima_that_fail_do_not_end_a_good_estimate(twins, body, linear, settings):
-    """They are left out of the comparison, and it is said why."""
-    first = linear.candidates[0]
-    rest = np.zeros(len(first.minimum.unknowns) - 1)
-    others = []
-    for by, error in zip((1.0, 2.0, -1.0), FAILURES, strict=True):
-        away = replace(first.minimum, unknowns=first.minimum.unknowns + np.append(by, rest))
-        iterate = under(failing(body[2], error), replace(first.iterate, minimum=away))
-        others.append(Candidate(iterate, first.value))
-    starts = (linear.starts[0], *(replace(linear.starts[1], candidate=k) for k in (1, 2, 3)))
-    said = list[str]()
-    several = replace(linear, candidates=(first, *others), starts=starts)
-    found = followed(several, settings.bounds, progress=said.append)
-    assert all(any(str(failure) in line for line in said) for failure in FAILURES)
-    assert found.minimum.converged
-    assert np.abs(found.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
-    assert [c.minimum.outcome for c in found.candidates[1:]] == list(FAILURES.values())
-    assert [start.candidate for start in found.starts] == [0, 1, 2, 3]
-
-
-def test_starts_that_merge_under_the_law_of_the_case_are_one_candidate(twins, linear, settings):
-    """Two linear minima, from which the law of the case leads to the same moduli."""
-    first = linear.candidates[0]
-    away = first.minimum.unknowns + np.append(0.2, np.zeros(len(first.minimum.unknowns) - 1))
-    elsewhere = replace(first.iterate, minimum=replace(first.minimum, unknowns=away))
-    starts = (linear.starts[0], replace(linear.starts[1], candidate=1))
-    both = replace(linear, candidates=(first, Candidate(elsewhere, first.value + 1.0)), starts=starts)
-    found = followed(both, settings.bounds)
-    assert len(found.candidates) == 1
-    assert [start.candidate for start in found.starts] == [0, 0]
-    assert np.abs(found.minimum.unknowns[:2] - twins.TRUTH).max() < 1e-3
+def test_it_goes_on_where_the_linear_law_has_led(twins, body):
+    """To the same unknowns, under the same prior, with the equilibrium there."""
+    _, problem, model = body
+    objective = twins.objective_of(problem, body[0].coefficients)
+    start = begun(objective, body[0].unknowns)
+    near = at_finite_strain(start, progress=silent)
+    moduli, q, approximation = split(near)
+    assert np.array_equal(near.minimum.unknowns, start.minimum.unknowns)
+    assert near.objective.parameters is start.objective.parameters
+    assert not near.settled
+    exact = model.solve(moduli, q).values
+    assert np.abs(approximation.model.solve(moduli, q).values - exact).max() < 1e-3

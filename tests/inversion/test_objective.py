@@ -169,13 +169,18 @@ def with_a_held_tissue(twins, twin, sd):
     return objective_of(replace(problem, parameters=parameters)), np.concatenate([twin.unknowns, [0.0]])
 
 
-def test_derivatives_are_exact_along_what_decides_with_held_blocks_free_too(twins, twin):
-    """So that an estimate goes on with them free from where it has ended, and no model is made exact there again."""
+def freed(objective):
+    """The prior of its unknowns with layers."""
+    return objective.parameters.choosing({len(objective.parameters.blocks) - 1: 1})
+
+
+def test_derivatives_are_exact_along_what_decides_with_layers_too(twins, twin):
+    """So that what is compared next needs no model made exact there again."""
     held, unknowns = with_a_held_tissue(twins, twin, sd=0.4)
     evaluation, (basis,) = held(unknowns), held.approximations
-    (point,) = held.linearisation_points(unknowns, evaluation)
-    free, seen = held.released(evaluation, unknowns)
-    along = free.parameters.chain(0, unknowns) @ deciding_directions(seen, 2)[free.parameters.unknowns_of(0)]
+    free = evaluation.under(freed(held), unknowns)
+    (point,) = held.linearisation_points(unknowns, [evaluation, free])
+    along = freed(held).chain(0, unknowns) @ deciding_directions(free, 2)[freed(held).unknowns_of(0)]
     assert np.allclose(point.directions[:, 4:], along[:, 2:], atol=1e-12)
     assert not np.allclose(point.directions[:, 2:4], along[:, 2:], rtol=0.01)
     truth = basis.full_model.solve(point.moduli, point.coefficients).tangent() @ along
@@ -186,27 +191,18 @@ def test_derivatives_are_exact_along_what_decides_with_held_blocks_free_too(twin
     assert after < 0.01 * before
 
 
-def test_j_holds_how_seldom_what_is_released_differs(twins, twin):
-    """Where layers are free J has their log prior odds, else not."""
+def test_another_prior_is_the_same_as_evaluated_under_it(twins, twin):
     held, unknowns = with_a_held_tissue(twins, twin, sd=0.4)
-
-    def total(objective, evaluation, odds):
-        blocks = [replace(b, released_odds=odds * bool(b.released_odds)) for b in objective.parameters.blocks]
-        parameters = replace(objective.parameters, blocks=tuple(blocks))
-        return replace(objective, parameters=parameters).total(evaluation)
-
-    free = held.released(held(unknowns), unknowns)
-    assert total(*free, -3.0) - total(*free, 0.0) == pytest.approx(3.0)
-    assert total(held, held(unknowns), -3.0) == total(held, held(unknowns), 0.0)
+    unknowns[-1] = 0.1
+    seen, anew = held(unknowns).under(freed(held), unknowns), held.believing(freed(held))(unknowns)
+    for name in ("value", "score", "matrix", "prior", "prior_score"):
+        assert getattr(seen, name) == pytest.approx(getattr(anew, name), rel=1e-6, abs=1e-5)  # 1e8 of what is held
 
 
 def test_a_known_tissue_released_as_a_whole_is_a_prior_of_the_scale(twins, twin):
     """Moduli scaled together leave u unchanged: ln E of all organs then varies by as much as that of the tissue."""
     sd = 0.4
     held, unknowns = with_a_held_tissue(twins, twin, sd)
-    free, seen = held.released(held(unknowns), unknowns)
-    anew = free(unknowns)
-    for name in ("value", "score", "matrix"):
-        assert getattr(seen, name) == pytest.approx(getattr(anew, name), rel=1e-6, abs=1e-5)  # 1e8 of what is held
+    seen = held(unknowns).under(freed(held), unknowns)
     before, after = (of.covariance_columns(2)[:2] for of in (held(unknowns), seen))
     assert after - before == pytest.approx(np.full((2, 2), sd**2), rel=0.02)

@@ -25,8 +25,7 @@ from palpate.observation.target import surface_target
 from palpate.phantoms.motion import smooth_field
 from palpate.phantoms.scene import Scene, centred_grid, imaged
 from palpate.phantoms.shapes import ball
-from palpate.unknowns import Block, parameter_map, unit_blocks
-from palpate.unknowns.blocks import Acts
+from palpate.unknowns import parameter_map, unit_blocks
 from palpate_validation.truth import exact_target, target_of_truth
 
 BALLS = (ball([0.0, -9.0, -4.0], 8.0), ball([0.0, -4.0, 11.0], 7.0), ball([0.0, 9.0, -2.0], 7.0))
@@ -137,15 +136,6 @@ def objective_of(problem, coefficients=None) -> Objective:
     if coefficients is not None:
         bases = [basis.with_modulus_series(coefficients, parameters.selection) for basis in bases]
     return with_first_noise(Objective(problem.states, parameters).under(bases))
-
-
-def mixture(objective, levels, *, acts=Acts.BOUNDARY, **named) -> Objective:
-    """The objective whose driver's modes are believed to vary by one of some levels, all as likely."""
-    size, odds = objective.parameters.n_coefficients, (0.0,) * len(levels)
-    terms = tuple((level**2 * np.eye(size),) for level in levels)
-    block = Block("a", "wall", acts, (0,), np.eye(size) / levels[0] ** 2, terms, (1.0, 1.0), odds, **named)
-    parameters = replace(objective.parameters, blocks=(block,), nuisance_precision=np.eye(size) / levels[0] ** 2)
-    return replace(objective, parameters=parameters)
 
 
 def settings(*ratios, limits=(0.02, 200.0), n=2, **others) -> InversionSettings:

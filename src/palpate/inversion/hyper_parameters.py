@@ -150,13 +150,18 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
 
 
 def evident_variances(
-    terms: Sequence[NDArray[np.float64]], information: NDArray[np.float64], pull: NDArray[np.float64]
+    terms: Sequence[NDArray[np.float64]],
+    information: NDArray[np.float64],
+    pull: NDArray[np.float64],
+    *,
+    sweeps: int = SWEEPS,
 ) -> NDArray[np.float64]:
     """The variances v (n_terms,) of a prior sum_t v_t C_t, C_t (n, n), of the largest evidence.
 
     information A (n, n) = R^T R and pull b = R^T t (n,) are what data say. With D_t = R C_t R^T and K = sum_t v_t D_t,
     v_t <- v_t (w^T D_t w / tr((1 + K)^-1 D_t))^(1/2), w = (1 + K)^-1 t: every sweep raises the evidence (Zhou, Hu, Zhou
-    & Lange, J. Comput. Graph. Stat. 28 (2019) 350).
+    & Lange, J. Comput. Graph. Stat. 28 (2019) 350). A term that moves nothing seen keeps 1, with which it begins;
+    `sweeps`: the largest number.
     """
     sizes, vectors = linalg.eigh(information, check_finite=False)
     kept = sizes > len(sizes) * np.finfo(np.float64).eps * sizes[-1]
@@ -168,12 +173,13 @@ def evident_variances(
     )
     low, high = np.square(AMPLITUDES)
     variances = np.ones(len(terms))
-    for _ in range(SWEEPS):
+    for _ in range(sweeps):
         inverse = np.linalg.inv(np.eye(len(target)) + np.tensordot(variances, seen, axes=1))
         at_best = inverse @ target
         explained = np.einsum("i,tij,j->t", at_best, seen, at_best, optimize=True)
-        expected = np.maximum(np.einsum("tij,ij->t", seen, inverse), np.finfo(np.float64).tiny)
-        before, variances = variances, np.clip(variances * np.sqrt(explained / expected), low, high)
+        expected = np.einsum("tij,ij->t", seen, inverse)
+        ratios = np.divide(explained, expected, out=np.ones(len(terms)), where=expected > np.finfo(np.float64).eps)
+        before, variances = variances, np.clip(variances * np.sqrt(ratios), low, high)
         if np.all(np.abs(variances - before) < SETTLED * before):
             break
     return variances

@@ -101,10 +101,17 @@ class Evaluation:
     def covariance_columns(self, n_parameters: int) -> NDArray[np.float64]:
         """H^-1 [e_1, ..., e_k] (n, k) of the first k unknowns, the log-moduli, with the Gauss-Newton matrix H.
 
-        Raises `EstimationError` where neither images nor prior determine some unknown.
+        The variance of a modulus that moves nothing is infinite, and that of no other. Raises `EstimationError` where
+        neither images nor prior determine some other unknown.
         """
+        n, seen = len(self.matrix), np.diag(self.matrix) > 0.0
+        seen[n_parameters:] = True
+        within, images = np.ix_(seen, seen), among(self.images, seen)
+        found = np.diag(np.where(seen, 0.0, np.inf))[:, :n_parameters]
         with determined():
-            return solve_by_image(self.matrix, np.eye(len(self.matrix))[:, :n_parameters], self.images)
+            answer = solve_by_image(self.matrix[within], np.eye(n)[seen][:, :n_parameters], images)
+        found[seen] = answer
+        return found
 
     def under(self, parameters: ParameterMap, unknowns: NDArray[np.float64]) -> Evaluation:
         """The same at `unknowns` (n_unknowns,), where it is of, under another prior of these."""
@@ -118,12 +125,6 @@ class Evaluation:
             prior=prior,
             prior_score=pull,
         )
-
-    def of_those(self, kept: NDArray[np.bool_]) -> Evaluation:
-        """The same matrix and score of the unknowns that are `kept` (n,) alone, without residuals."""
-        within, images = np.ix_(kept, kept), among(self.images, kept)
-        own = (self.score[kept], self.matrix[within], (), self.prior[within], self.prior_score[kept])
-        return Evaluation(self.value, self.misfit_mm2, *own, images)
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,10 +334,11 @@ def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np
     First the unit vectors e_i of the parameters, then h_i = H^-1 e_i with the Gauss-Newton matrix H. Where the
     derivatives J h_i of the residuals are exact, so are to first order in an error of the other columns of J the
     parameters' part of the step, e_i^T H^-1 J^T W r = (J h_i)^T W r + ..., their gain (J h_i)^T W and their variance
-    e_i^T H^-1 e_i, whose variation is -2 (dJ h_i)^T W J h_i.
+    e_i^T H^-1 e_i, whose variation is -2 (dJ h_i)^T W J h_i. h_i is 0 of a modulus that moves nothing.
     """
     unit = np.eye(len(evaluation.matrix))[:, :n_parameters]
-    return np.concatenate([unit, evaluation.covariance_columns(n_parameters)], axis=1)
+    columns = evaluation.covariance_columns(n_parameters)
+    return np.concatenate([unit, np.where(np.isfinite(columns), columns, 0.0)], axis=1)
 
 
 def _robust_weights(observation: Observation, residuals: Residuals) -> NDArray[np.float64]:

@@ -139,12 +139,8 @@ def posterior_sd(minimum: Minimum, n_parameters: int) -> NDArray[np.float64]:
     Infinite where a modulus moves nothing, as in a body at rest. Raises `EstimationError` where neither images nor
     prior determine some other unknown.
     """
-    evaluation, sd = minimum.evaluation, np.full(n_parameters, np.inf)
-    seen = np.diag(evaluation.matrix) > 0.0
-    kept = seen[:n_parameters]
-    own = evaluation if seen.all() else evaluation.of_those(seen)
-    sd[kept] = np.sqrt(np.diag(own.covariance_columns(int(kept.sum()))))
-    return sd
+    covariance = minimum.evaluation.covariance_columns(n_parameters)[:n_parameters]
+    return np.asarray(np.sqrt(np.diag(covariance)))
 
 
 def same_minimum(unknowns: NDArray[np.float64], minimum: Minimum, n_parameters: int) -> bool:

@@ -116,8 +116,8 @@ def searched(
 ) -> Searched:
     """The search followed from where it has `begun` until the posterior's mean moves no more by the `rule`.
 
-    While a step is longer than a standard deviation the noise is fitted anew; with the first shorter one it stays, and
-    so does the objective. begins (n_unknowns,) each: where further minima are sought. A search that does not end by its
+    The noise is fitted anew until a step was no longer than a standard deviation, and once more where that led: fitted
+    further away, it has correlations of what is still motion. Then it stays, and so does the objective. begins (n_unknowns,) each: where further minima are sought. A search that does not end by its
     rule says so in its minimum's outcome. Raises `EstimationError`s of models that cannot be solved.
     """
     now = begin
@@ -137,7 +137,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     near = Bounds(np.maximum(bounds.lower, theta - radius), np.minimum(bounds.upper, theta + radius))
     objective, evaluation = _fitted(now, near)
     posterior = cheapest_posterior(objective, at.unknowns, evaluation)
-    exact = now.settled and now.moved < 1.0
+    exact = now.moved < 1.0
     few = {} if exact else {"most": FEW}
     mixture = mixture_of(posterior, at.unknowns, evaluation, bounds if exact else near, begins=begins, **few)
     objective = objective.believing(objective.parameters.choosing(mixture.explanations[0].chosen))
@@ -146,10 +146,10 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     if exact and moved < rule.step_sd:
         evaluation = evaluation.under(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
-        return replace(now, objective=objective, minimum=minimum, mixture=mixture, moved=moved)
+        return replace(now, objective=objective, minimum=minimum, mixture=mixture, moved=moved, settled=True)
     led = (*now.led[-MEMORY:], (theta, mixture.mean))
     target = _target(posterior, objective, mixture, np.clip(_fixed_point(led, sd), near.lower, near.upper))
-    settled = now.settled or moved < 1.0
+    settled = now.settled or exact
     before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled, led=led)
     return _taken(before, evaluation, target)
 
@@ -205,7 +205,7 @@ def _taken(now: Searched, evaluation: Evaluation, target: NDArray[np.float64]) -
     before = evaluation.under(objective.parameters, at.unknowns).value
     for _ in range(HALVINGS):
         try:
-            there = _exact(objective, evaluation.under(objective.parameters, at.unknowns), target, near=now.settled)
+            there = _exact(objective, evaluation.under(objective.parameters, at.unknowns), target, near=now.moved < 1.0)
         except (NotConverged, SolverError) as error:
             failure, target = error, at.unknowns + 0.5 * (target - at.unknowns)
             continue

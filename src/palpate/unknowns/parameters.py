@@ -130,19 +130,15 @@ class ParameterMap:
     def __post_init__(self) -> None:
         n = self.n_parameters
         object.__setattr__(self, "_layout", _Layout.of(self.blocks, n, len(self.base)))
-        defaults = {
-            "prior_mean": np.zeros(n),
-            "prior_precision": np.zeros((n, n)),
-            "nuisance_precision": joined(self.blocks),
-        }
-        for name, default in defaults.items():
+        k = self.n_coefficients
+        for name, shape in {"prior_mean": (n,), "prior_precision": (n, n), "nuisance_precision": (k, k)}.items():
             given = getattr(self, name)
-            if not given.size:
-                object.__setattr__(self, name, default)
-            elif given.shape != default.shape:
+            if not given.size:  # inverses of all blocks' covariances are formed only where they are asked for
+                blank = joined(self.blocks) if name == "nuisance_precision" else np.zeros(shape)
+                object.__setattr__(self, name, blank)
+            elif given.shape != shape:
                 raise ConfigurationError(
-                    f"{name} has the shape {given.shape}; {n} parameters and {self.n_coefficients} unknowns in blocks"
-                    f" need {default.shape}"
+                    f"{name} has the shape {given.shape}; {n} parameters and {k} unknowns in blocks need {shape}"
                 )
 
     @property

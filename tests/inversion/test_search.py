@@ -1,0 +1,234 @@
+"""The search's loop, on patients without a mesh: where it ends, what stays on the way, and what it does not hang on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.errors import EstimationError, NotConverged
+from palpate.inversion import REPORTED, Bounds, Objective, Outcome, StopRule, begun, first_noise_of, invert, searched
+from palpate.progress import silent
+
+LEARNED = (1e-3, 10.0)  # bounds of a scale that residuals tell
+FRAME = 4
+
+
+@pytest.fixture(scope="module")
+def bent(patients):
+    """A body that bends, whose frame has moved, and what was read with a noise that is not known."""
+    rng = np.random.default_rng(2)
+    of = patients.with_unknowns(patients.patient(rng, bend=0.6), FRAME, [1.0, -1.5])
+    return of, of.problem(rng, bounds=LEARNED, scale=2.0)
+
+
+@pytest.fixture(scope="module")
+def found(patients, bent):
+    return invert(bent[1], patients.settings(), progress=silent)
+
+
+def begin(problem, theta=(0.0, 0.0)):
+    unknowns = np.concatenate([theta, np.zeros(problem.parameters.n_coefficients)])
+    return begun(Objective(problem.states, problem.parameters), unknowns)
+
+
+def one_more(patients, now, rule=REPORTED):
+    once = replace(rule, iterations=1)
+    return searched(now, patients.WIDE, once, progress=silent, title="")
+
+
+def way(patients, now, rule=REPORTED):
+    """Where a search is after each iteration."""
+    places = [now]
+    while places[-1].minimum.outcome is Outcome.STEPS and len(places) < 12:
+        places.append(one_more(patients, places[-1], rule))
+    return places
+
+
+def sd_of(mixture):
+    return np.sqrt(np.diag(mixture.covariance))
+
+
+def scales(objective):
+    return [(o.weighting.sd, o.weighting.count) for o in objective.observations]
+
+
+def test_it_ends_near_the_truth_in_few_iterations(bent, found):
+    of, _ = bent
+    assert found.minimum.converged
+    assert len(found.minimum.history) <= 6
+    assert np.all(np.abs(found.mixture.mean - of.truth[:2]) < 3.0 * sd_of(found.mixture))
+    assert np.all(np.abs(found.minimum.unknowns[:2] - found.mixture.mean) < REPORTED.step_sd * sd_of(found.mixture))
+
+
+def test_the_noise_is_that_of_the_readings(patients, found):
+    sds = [sd for sd, _ in scales(found.objective)]
+    assert sds == pytest.approx([sds[0]] * 2)
+    assert sds[0] == pytest.approx(2.0 * patients.SD, rel=0.4)  # of 18 readings
+
+
+def test_the_objective_stays_once_it_is_settled(patients, bent):
+    """Its noise before, and where models are exact J at any place under any explanation."""
+    places = way(patients, begin(bent[1], theta=(2.0, 2.0)), StopRule(step_sd=1e-3))
+    assert places[-1].minimum.converged
+    for _ in range(2):
+        end = places[-1]
+        places.append(one_more(patients, replace(end, minimum=replace(end.minimum, outcome=Outcome.STEPS))))
+    settled = [place for place in places if place.settled]
+    assert len(settled) > 2
+    assert scales(places[1].objective) != scales(places[0].objective)
+    assert all(scales(place.objective) == scales(settled[0].objective) for place in settled)
+    first = settled[0]
+    chosen = first.posterior.explanations[0].chosen
+    body = bent[0].bodies[0]
+    values = []
+    for place in settled:
+        whole = place.objective.under([patients.Whole(body)])
+        values.append(whole.believing(whole.parameters.choosing(chosen))(first.minimum.unknowns).value)
+    assert values == pytest.approx([values[0]] * len(values), rel=1e-12)
+
+
+def test_convergence_is_a_property_of_where_it_ends(patients, bent, found):
+    """A search that goes on from there, or begins there with that noise, moves no more."""
+    end = way(patients, begin(bent[1]))[-1]
+    again = one_more(patients, replace(end, minimum=replace(end.minimum, outcome=Outcome.STEPS)))
+    assert again.minimum.outcome is Outcome.CONVERGED
+    assert again.moved == pytest.approx(end.moved, abs=1e-6)
+    anew = searched(begun(end.objective, end.minimum.unknowns), patients.WIDE, REPORTED, progress=silent, title="again")
+    assert np.all(np.abs(anew.posterior.mean - found.mixture.mean) < 2.0 * REPORTED.step_sd * sd_of(found.mixture))
+
+
+@pytest.mark.parametrize("theta", [(2.0, 2.0), (-1.0, 1.0), (-0.8, -1.0), (3.0, 0.0)])
+def test_the_way_does_not_show(patients, bent, found, theta):
+    """Of a body that answers ever more to a larger modulus."""
+    end = way(patients, begin(bent[1], theta))[-1]
+    assert end.minimum.converged
+    assert np.all(np.abs(end.posterior.mean - found.mixture.mean) < 2.0 * REPORTED.step_sd * sd_of(found.mixture))
+    assert sd_of(end.posterior) == pytest.approx(sd_of(found.mixture), rel=0.03)
+    assert end.posterior.explanations[0].chosen == found.mixture.explanations[0].chosen
+    assert scales(end.objective)[0][0] == pytest.approx(scales(found.objective)[0][0], rel=0.02)
+
+
+def test_models_are_exact_where_it_ends(bent, found):
+    of, _ = bent
+    objective, x = found.objective, found.minimum.unknowns
+    moduli, (q,) = objective.parameters.moduli(x), objective.parameters.coefficients(x)
+    stated, exact = (model.solve(moduli, q) for model in (objective.approximations[0].model, of.bodies[0]))
+    assert stated.values == pytest.approx(exact.values, abs=1e-12)
+    assert stated.tangent() == pytest.approx(exact.tangent(), abs=1e-12)
+
+
+def test_it_ends_where_the_body_itself_would(patients, bent, found):
+    of, _ = bent
+    rng = np.random.default_rng(2)
+    patients.patient(rng, bend=0.6)  # the same errors
+    whole = invert(of.problem(rng, bounds=LEARNED, scale=2.0, whole=True), patients.settings(), progress=silent)
+    assert whole.minimum.converged
+    assert np.all(np.abs(whole.mixture.mean - found.mixture.mean) < 3.0 * REPORTED.step_sd * sd_of(found.mixture))
+
+
+def test_every_start_is_told_and_none_moves_a_single_minimum(patients, bent, found):
+    starts = [0.4, 0.1], [-0.9, 0.5], [1.5, 1.5]
+    several = invert(bent[1], patients.settings(*starts), progress=silent)
+    assert [run.theta.tolist() for run in several.starts] == list(starts)
+    assert all(run.candidate == 0 for run in several.starts if run.minimum.converged)
+    assert np.all(np.abs(several.mixture.mean - found.mixture.mean) < 2.0 * REPORTED.step_sd * sd_of(found.mixture))
+
+
+def test_a_second_minimum_that_a_start_leads_to_is_in_the_posterior(patients):
+    """Of a body that answers to ln E as to 2 - ln E."""
+    rng = np.random.default_rng(12)
+    of = patients.without(patients.patient(rng, bend=-1.0), (0, 1, 2, 3))
+    found = invert(of.problem(rng, whole=True), patients.settings([0.4, -0.3], [1.7, -0.3]), progress=silent)
+    assert {run.candidate for run in found.starts} == {0, 1}
+    assert found.mixture.mean[0] == pytest.approx(1.0, abs=0.01)
+    assert sd_of(found.mixture)[0] > 0.25
+
+
+@pytest.mark.parametrize("gain", [0.0, 1e-9, 1e-4])
+@pytest.mark.parametrize("n_images", [1, 2])
+def test_a_modulus_that_moves_next_to_nothing_is_left_open(patients, gain, n_images):
+    rng = np.random.default_rng(3)
+    of = patients.patient(rng, n_images, gain=(1.0, gain))
+    found = invert(of.problem(rng, bounds=LEARNED), patients.settings(), progress=silent)
+    assert found.minimum.converged
+    assert len(found.minimum.history) <= 6
+    assert sd_of(found.mixture)[1] > 50.0
+    assert sd_of(found.mixture)[0] < 0.1
+    assert abs(found.mixture.mean[0] - of.truth[0]) < 4.0 * sd_of(found.mixture)[0]
+
+
+def test_a_body_that_does_not_move_at_all_is_no_error(patients):
+    of = patients.patient(np.random.default_rng(3), gain=(0.0, 0.0))
+    found = invert(of.problem(bounds=LEARNED), patients.settings(), progress=silent)
+    assert found.minimum.converged
+    assert np.isinf(sd_of(found.mixture)).all()
+
+
+def test_too_few_iterations_are_not_called_convergence(patients, bent):
+    found = invert(bent[1], patients.settings(), progress=silent, rule=StopRule(iterations=1))
+    assert found.minimum.outcome is Outcome.STEPS
+    assert not found.minimum.converged
+    assert found.mixture.weights.sum() == pytest.approx(1.0)
+
+
+def test_bounds_hold_on_the_way_and_at_the_end(patients, bent):
+    narrow = replace(patients.settings(), bounds=Bounds(np.full(2, -0.1), np.full(2, 0.1)))
+    found = invert(bent[1], narrow, progress=silent)
+    assert found.minimum.converged
+    assert all(np.all(np.abs(iterate.theta) <= 0.1) for iterate in found.minimum.history)
+    assert narrow.bounds.reached(found.minimum.unknowns[:2]).any()
+
+
+def test_no_posterior_is_known_before_the_first_iteration(bent):
+    with pytest.raises(EstimationError, match="first iteration"):
+        _ = begin(bent[1]).posterior
+
+
+def test_every_iteration_is_reported_with_the_moduli(patients, bent):
+    said = list[str]()
+    found = invert(bent[1], patients.settings(), progress=said.append)
+    told = [line for line in said if "iteration" in line]
+    assert len(told) >= len(found.minimum.history)
+    assert all("gland" in line and "sac" in line for line in told)
+
+
+def test_the_first_noise_is_that_with_which_an_estimate_ends(patients, bent, found):
+    objective, minimum = first_noise_of(bent[1], patients.settings(), progress=silent)
+    assert scales(objective)[0][0] == pytest.approx(scales(found.objective)[0][0], rel=0.02)
+    assert np.all(np.abs(minimum.unknowns[:2] - found.mixture.mean) < sd_of(found.mixture))
+
+
+def folded(patients, bent, times):
+    """A search's begin with an approximation that cannot be made exact so many times."""
+    failures = list[int]()
+
+    class Folded(patients.Expanded):
+        def update(self, at, others=()):
+            if len(failures) < times:
+                failures.append(1)
+                raise NotConverged("folded")
+            return super().update(at, others)
+
+    start = begin(bent[1])
+    (whole,) = start.objective.approximations
+    approximation = Folded(whole.body, whole.model)
+    return replace(start, objective=start.objective.under([approximation]))
+
+
+def test_a_step_to_where_nothing_can_be_solved_is_halved(patients, bent):
+    lengths = [
+        np.abs(one_more(patients, folded(patients, bent, times)).minimum.unknowns[:2]).max() for times in (0, 1, 2)
+    ]
+    assert lengths[1:] == pytest.approx([lengths[0] / 2.0, lengths[0] / 4.0])
+
+
+def test_where_every_shorter_one_fails_too_the_reason_is_told(patients, bent):
+    with pytest.raises(NotConverged, match="folded"):
+        one_more(patients, folded(patients, bent, 99))
+
+
+def test_what_it_cost_is_counted(found):
+    assert found.evaluations == 1 + len(found.minimum.history)
+    assert found.counts.forward == len(found.minimum.history) - 1  # exact anew at every place but the first
