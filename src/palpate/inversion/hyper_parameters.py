@@ -134,7 +134,11 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
             own = objective.parameters.columns(i)
             prior = objective.parameters.prior_matrix
             data = evaluation.matrix - evaluation.prior
-            pull = data @ unknowns - (evaluation.score - evaluation.prior_score) + prior @ objective.parameters.prior_centre
+            pull = (
+                data @ unknowns
+                - (evaluation.score - evaluation.prior_score)
+                + prior @ objective.parameters.prior_centre
+            )
             with determined():
                 information, of_own = _seen_of(prior, data, pull, own)
                 terms = [term + LEAST_VARIANCE * np.eye(block.size) for term in block.terms]
@@ -158,7 +162,10 @@ def evident_variances(
     kept = sizes > len(sizes) * np.finfo(np.float64).eps * sizes[-1]
     kept[-1] = True
     roots, axes = np.sqrt(np.maximum(sizes[kept], np.finfo(np.float64).tiny)), vectors[:, kept].T
-    target, seen = axes @ pull / roots, np.stack([(roots[:, None] * axes) @ c @ (roots[:, None] * axes).T for c in terms])
+    target, seen = (
+        axes @ pull / roots,
+        np.stack([(roots[:, None] * axes) @ c @ (roots[:, None] * axes).T for c in terms]),
+    )
     low, high = np.square(AMPLITUDES)
     variances = np.ones(len(terms))
     for _ in range(SWEEPS):

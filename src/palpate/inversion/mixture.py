@@ -248,9 +248,7 @@ class LinearEvidence:
             taken = across.T @ answer
             yield (
                 alternatives,
-                _Eliminated(
-                    answer[:, :-1], answer[:, -1], taken[:, :-1], taken[:, -1], level + alternatives.log_odds
-                ),
+                _Eliminated(answer[:, :-1], answer[:, -1], taken[:, :-1], taken[:, -1], level + alternatives.log_odds),
             )
 
     def compared(self, most: int) -> list[_Compared]:

@@ -24,7 +24,6 @@ from palpate.report.pairs import ImagePair, bone_distances, drawn_images, image_
 from palpate.report.report_data import (
     MAP_OF,
     MESH,
-    VARIATION,
     LaterImage,
     MeasuredState,
     MeshPicture,
@@ -201,8 +200,7 @@ def _brought(case: Case) -> list[tuple[str, str]]:
         found.append(("measurement", f"{words}, state {data.state}"))
     for tissue in case.tissues:
         if prior := tissue.with_labels(()).field:  # of ln E inside it
-            law = VARIATION if prior.total_variation else "Gaussian, Matern's kernel"
-            words = f"{law}, sd {prior.sd:g} of ln E, length {prior.length_mm:g} mm"
+            words = f"Gaussian, Matern's kernel, sd {prior.sd:g} of ln E, length {prior.length_mm:g} mm"
             found.append((f"{MAP_OF}{tissue.name}", words))
     return [*found, ("body", MESH)] if case.body is not None else found
 

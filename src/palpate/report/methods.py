@@ -10,7 +10,7 @@ from typing import Any
 
 from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import LAWS, law_from, law_parameters
-from palpate.report.report_data import MAP_OF, MESH, VARIATION, ReportData
+from palpate.report.report_data import MAP_OF, MESH, ReportData
 from palpate.report.rows import CAUSES, listed, moduli_in, ratio_rows
 from palpate.report.units import given_text
 from palpate.unknowns import KNOWN_MODULUS
@@ -67,12 +67,15 @@ def methods_text(data: ReportData) -> Methods:
             " of all other unknowns, of the noise and of the priors' amplitudes was minimised from"
             f" {len(data.document['starts'])} starts by Gauss-Newton steps in a trust region {cite('nocedal')}, on a"
             f" reduced basis whose error was bounded at the estimate {cite('reduced')}."
-            f"{onwards if law is not None and law.finite else ''}"
+            f"{onwards if law is not None and law.finite else ''} The posterior was a mixture over explanations of the"
+            " images: how patchy the tissues are, layers around organs, in each later image the frame's motion and how"
+            " surfaces are drawn. Each had its own minimum, and the weight of its evidence in Laplace's approximation."
         ),
         (
-            "The 95 % intervals come from the sandwich covariance of the parameters under spatially correlated"
-            f" residuals {cite('white')}, with the scatter over the voxel grid's position and a term for the mesh"
-            f" added{leaning}.{covered} The seed of random numbers was {data.document['seed']}."
+            "Values are medians of this mixture, 95 % intervals its equal-tailed quantiles. Its spread was widened by"
+            f" the sandwich covariance of the parameters under spatially correlated residuals {cite('white')}, with the"
+            f" scatter over the voxel grid's position and a term for the mesh added{leaning}.{covered} The seed"
+            f" of random numbers was {data.document['seed']}."
         ),
     )
     own = SOURCES["palpate"]
@@ -134,8 +137,7 @@ def _model(data: ReportData, cite: Callable[[str], str]) -> str:
     if settings.get("body") == MESH:
         made = f"The mesh{size} was given."
     kernel = cite("kernel")
-    source = f" {cite('variation')}" if any(VARIATION in prior for prior in priors.values()) else ""
-    mapped = f" Inside {fields} ln E was a field{source}." if priors else ""
+    mapped = f" Inside {fields} ln E was a field." if priors else ""
     return (
         f"{made} The tissues followed"
         f" {law.description if law else 'the law ' + document['law']} in"

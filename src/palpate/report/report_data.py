@@ -14,7 +14,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.study.archive import MAY_BE_NAN, read_archive, write_archive
 
 MESH = "a mesh"  # the setting "body" of a case without images
-MAP_OF, VARIATION = "map of ", "total variation"  # a setting with a tissue's name; the prior that is not Gaussian
+MAP_OF = "map of "  # a setting with a tissue's name
 
 FORMAT = "palpate.report-data/4"
 MOST_ARROWS = 400  # of one kind of data in a later state: more hide each other

@@ -13,7 +13,6 @@ from palpate.study.schema import nearest, rule, shown
 from palpate.uncertainty.intervals import NORMAL_95
 
 REMAINING = "remaining"
-GAUSSIAN, TOTAL_VARIATION = FIELD_PRIORS = ("gaussian", "total-variation")
 TISSUE_ROLES = tuple(str(role) for role in Role if role is not Role.SLIDING)
 KILOPASCALS = (1e-3, 1e9)  # of a modulus: from the softest gels to diamond
 POISSON_RATIO = 0.45
@@ -53,8 +52,7 @@ class CaseTissue:
     `poisson_ratio` None: 0.45, or what a phantom draws; `poisson_ratio_sd`: its prior standard deviation
     where it is estimated, None: 0.03. `youngs_modulus_kpa`: a number, or the 95 % range of what is believed of a
     `known` one. `modulus` "field": it varies in the tissue and is mapped; `field_sd`: prior standard deviation of ln E
-    inside, `field_length_mm`: of its kernel; `field_prior`: Gaussian, or by its total variation; `field_modes`: how
-    many modes make it at the most.
+    inside, `field_length_mm`: of its kernel; `field_modes`: how many modes make it at the most.
     """
 
     name: str
@@ -76,7 +74,6 @@ class CaseTissue:
     modulus: str = field(default="one", metadata=rule(choices=("one", "field")))
     field_sd: float = field(default=0.7, metadata=rule(between=(0.01, 3.0)))
     field_length_mm: float = field(default=8.0, metadata=rule(between=(1.0, 1e3)))
-    field_prior: str = field(default=GAUSSIAN, metadata=rule(choices=FIELD_PRIORS))
     field_modes: int = field(default=400, metadata=rule(between=(1, 2000)))
 
     def __post_init__(self) -> None:
@@ -109,9 +106,7 @@ class CaseTissue:
     def with_labels(self, labels: tuple[int, ...]) -> Tissue:
         """The tissue with its labels; raises `ConfigurationError` when its constants are impossible."""
         ratio = POISSON_RATIO if self.poisson_ratio is None else self.poisson_ratio
-        believed = FieldPrior(
-            self.field_sd, self.field_length_mm, self.field_prior == TOTAL_VARIATION, self.field_modes
-        )
+        believed = FieldPrior(self.field_sd, self.field_length_mm, self.field_modes)
         mapped = believed if self.modulus == "field" else None
         return Tissue(self.name, self.role, labels, ratio, self.modulus_kpa, modulus_sd=self.modulus_sd, field=mapped)
 

@@ -29,7 +29,7 @@ class StatedPosterior:
     @property
     def covariance(self) -> NDArray[np.float64]:
         """Covariance (n, n) of the parameters under the likeliest explanation, by all that is known."""
-        return self.mixture.covariances[0]
+        return np.asarray(self.mixture.covariances[0])
 
 
 def stated_posterior(inversion: Inversion, own: Covariance, bounds: Bounds) -> StatedPosterior:

@@ -69,7 +69,8 @@ class ImagePairs:
 class ModulusRegion:
     """The joint 95 % region of two tissues' moduli (kPa, or ratios): places once around the estimate.
 
-    boundary: by the profile likelihood of both; ellipse: of ln E by their covariance; open: whether the bounds of the search cut the boundary.
+    boundary: by the profile likelihood of both; ellipse: of ln E by their covariance; open: whether the
+    bounds of the search cut the boundary.
     """
 
     tissues: tuple[str, str]

@@ -12,7 +12,16 @@ from palpate.parallel import mapped
 from palpate.study.estimated import ModulusEstimate, no_estimate
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.stated_posterior import StatedPosterior
-from palpate.uncertainty import NORMAL_95, Covariance, Interval, Marginal, ModulusInterval, log_interval, marginals_of, modulus_interval
+from palpate.uncertainty import (
+    NORMAL_95,
+    Covariance,
+    Interval,
+    Marginal,
+    ModulusInterval,
+    log_interval,
+    marginals_of,
+    modulus_interval,
+)
 from palpate.unknowns import KNOWN_MODULUS, ratio_of_eta
 
 IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
@@ -73,7 +82,9 @@ def intervals_of(inversion: Inversion, settings: InversionSettings, posterior: S
         ends = float(bounds.lower[i]), float(bounds.upper[i])
         middle = marginal.quantile(0.5, ends)
         theta = float(inversion.mixture.mean[i]) if middle is None else middle
-        found.append(Known(theta, marginal, own, marginal.interval(ends), bool(at_bound[i]), len(own.profile.theta) > 1))
+        found.append(
+            Known(theta, marginal, own, marginal.interval(ends), bool(at_bound[i]), len(own.profile.theta) > 1)
+        )
     return tuple(found)
 
 
@@ -84,7 +95,10 @@ def estimates_of(
     *,
     truth: Mapping[str, float],
 ) -> tuple[ModulusEstimate, ...]:
-    """The estimates of moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known. Values are medians."""
+    """The estimates of moduli whose intervals are `known`; `truth`: true moduli (kPa) by tissue, where known.
+
+    Values are medians.
+    """
     mapping, scale = inversion.objective.parameters, inversion.objective.parameters.scale_kpa
     none = [
         no_estimate(

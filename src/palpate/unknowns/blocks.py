@@ -170,7 +170,9 @@ def wall_blocks(wall: Wall, state: int, *, learned: bool = True) -> tuple[Block,
     n, m = len(wall.columns), wall.n_fine
     terms = [linalg.block_diag(of, np.zeros((m, m))) for of in (*wall.drifts, *wall.swellings)]
     terms += [np.diag(np.repeat([0.0, 1.0], [n, m]))] if m else []
-    own = Block(wall.name, "driver", Acts.BOUNDARY, (state,), only(np.eye(n + m)), terms=tuple(terms) if learned else ())
+    own = Block(
+        wall.name, "driver", Acts.BOUNDARY, (state,), only(np.eye(n + m)), terms=tuple(terms) if learned else ()
+    )
     return (own,) if n + m else ()
 
 
@@ -195,7 +197,10 @@ def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
             blocks.append(("smooth", tuple(levels)))
     if motion.n_rigid:
         unit = np.eye(motion.n_rigid)
-        rigid = Alternative(unit * STILL_RIGID**2, 0.0, "still"), Alternative(unit * MOVED_RIGID**2, 0.0, "moves")
+        rigid = (
+            Alternative(unit * STILL_RIGID**2, 0.0, "still as a whole"),
+            Alternative(unit * MOVED_RIGID**2, 0.0, "moves as a whole"),
+        )
         blocks.append(("rigid", rigid))
     return tuple(
         Block("frame", FRAME, Acts.BOUNDARY, (state,), levels, Choice.FRAME, unit_mm=motion.smooth_mm)
