@@ -34,7 +34,7 @@ from palpate.study.check import check_case
 from palpate.study.estimated import Estimation, Iteration, ModulusEstimate, Start, TissueFit
 from palpate.study.result import CaseResult, MeshSummary, Provenance
 from palpate.study.samples import ModulusSamples
-from palpate.uncertainty import ChainDiagnostics, Covariance
+from palpate.uncertainty import Covariance
 
 sys.path.insert(0, str(Path(__file__).parent))  # tests are no package; dicom_files.py lies here
 
@@ -193,17 +193,14 @@ def case_result() -> CaseResult:
 
 @pytest.fixture(scope="session")
 def sampled_result(case_result) -> CaseResult:
-    """The same with chains of the moduli that stay together, and their diagnostics."""
-    normal = np.random.default_rng(5).standard_normal((4, 150, 2))
+    """The same with draws of the moduli."""
+    normal = np.random.default_rng(5).standard_normal((150, 2))
     moduli = np.array([58.9, 31.2]) * np.exp(np.array([0.1, 0.245]) * normal)
     samples = ModulusSamples(
         ("prostate", "bladder"),
         "kPa",
         moduli,
-        -0.5 * (normal**2).sum(axis=2),
-        np.array([0.7, 0.72, 0.69, 0.71]),
         np.array([[48.0, 71.0], [19.0, np.nan]]),
-        ChainDiagnostics(np.array([1.001, 1.002]), np.array([610.0, 580.0]), np.array([500.0, 490.0])),
     )
     case = dataclasses.replace(case_result.case, estimate=Estimate(samples=150))
     estimation = dataclasses.replace(case_result.estimation, samples=samples)

@@ -226,10 +226,3 @@ def test_samples_without_an_output_count_as_nought_and_are_told():
     assert found.failed == pytest.approx(0.5, abs=0.01)
     assert found.variance[0] == pytest.approx(0.25, abs=0.01)
     assert found.first[0, 0] == pytest.approx(1.0, abs=0.05)
-
-
-def test_a_refit_that_never_settles_is_no_estimate(found, path):
-    """An organ that is drawn half a millimetre larger, and one pass where several are needed."""
-    errors = tuple(0.5 * by for by in surface_errors(found.minimum.evaluation, "gland"))
-    assert path.under(errors).converged
-    assert not path.under(errors, passes=1).converged

@@ -65,8 +65,9 @@ class Covariance:
     Parameters are the log-moduli, then eta = ln(lambda / mu) of Poisson's ratios that are sought. noise: of the
     residuals; prior: that of all unknowns, of which `causes` are the parts by the cause of their block;
     grid: the place of the voxels, as far as it is not in noise that the residuals tell, which voxels round; mesh: what
-    another mesh would make of it (of Young's moduli); held: the part of causes by blocks that are held. given_model: all
-    that would be left if frame, drawing and material were as the model has them, and only the drivers' motion unknown.
+    another mesh would make of it (of Young's moduli); held: the part of causes by blocks that are held; given_model:
+    all that would be left if frame, drawing and material were as the model has them, and only the drivers' motion
+    unknown.
     """
 
     noise: NDArray[np.float64]
