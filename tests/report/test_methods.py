@@ -49,20 +49,14 @@ def test_the_finite_strain_law_is_told_with_its_start(case_result):
         assert ("The linear law gave the start" in text) is told
 
 
-def test_the_prior_of_a_map_is_told_with_its_source(case_result, text):
-    for prior, told, cited in (
-        ("gaussian", "Gaussian, Matern's kernel", False),
-        ("total-variation", "total variation", True),
-    ):
-        first, *others = case_result.case.tissues
-        mapped = dataclasses.replace(first, modulus="field", field_prior=prior)
-        case = dataclasses.replace(case_result.case, tissues=(mapped, *others))
-        of_map = methods_text(collect(dataclasses.replace(case_result, case=case)))
-        assert f"Inside {first.name} ({told}, sd 0.7 of ln E, length 8 mm) ln E was a field" in " ".join(
-            of_map.paragraphs
-        )
-        assert any("total variation based noise removal" in source for source in of_map.sources) is cited
-        test_citations_and_sources_belong_together(of_map)
+def test_the_prior_of_a_map_is_told(case_result, text):
+    first, *others = case_result.case.tissues
+    mapped = dataclasses.replace(first, modulus="field")
+    case = dataclasses.replace(case_result.case, tissues=(mapped, *others))
+    of_map = methods_text(collect(dataclasses.replace(case_result, case=case)))
+    told = f"Inside {first.name} (Gaussian, Matern's kernel, sd 0.7 of ln E, length 8 mm) ln E was a field."
+    assert told in " ".join(of_map.paragraphs)
+    test_citations_and_sources_belong_together(of_map)
     assert "ln E was a field" not in " ".join(text.paragraphs)
 
 

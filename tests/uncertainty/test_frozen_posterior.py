@@ -35,10 +35,10 @@ def minimum(objective, twin):
 def test_the_frozen_posterior_has_the_value_and_score_of_the_objective_where_it_is_frozen(objective, minimum, rng):
     place = minimum + 0.05 * rng.standard_normal(len(minimum))
     frozen, evaluation = frozen_posterior(objective, place), objective(place)
-    assert frozen.value(place) == pytest.approx(evaluation.value, rel=1e-9)
+    assert frozen(place).value == pytest.approx(evaluation.value, rel=1e-9)
     for _ in range(3):
         step = 1e-4 * rng.standard_normal(len(minimum))
-        slope = 0.5 * (frozen.value(place + step) - frozen.value(place - step))
+        slope = 0.5 * (frozen(place + step).value - frozen(place - step).value)
         assert slope == pytest.approx(float(evaluation.score @ step), rel=1e-4, abs=1e-9)
 
 
@@ -46,7 +46,7 @@ def test_in_the_driver_the_frozen_posterior_is_the_quadratic_of_gauss_newton(obj
     frozen, evaluation = frozen_posterior(objective, minimum), objective(minimum)
     step = np.concatenate([np.zeros(2), 0.1 * rng.standard_normal(len(minimum) - 2)])
     expected = evaluation.value + evaluation.score @ step + 0.5 * step @ evaluation.matrix @ step
-    assert frozen.value(minimum + step) == pytest.approx(expected, rel=1e-9)
+    assert frozen(minimum + step).value == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_full_model_is_refused(objective, minimum, twin):
@@ -70,5 +70,5 @@ def test_an_expansion_that_bends_is_frozen_with_its_own_value_far_away(twins, rn
     evaluation = bent(unknowns)
     frozen, fixed = frozen_posterior(bent, unknowns, evaluation), fixed_correspondence(bent, unknowns, evaluation)
     away = unknowns + 0.5 * rng.standard_normal(len(unknowns))
-    assert frozen.value(away) == pytest.approx(fixed(away).value, rel=1e-9)
-    assert frozen.value(unknowns) == pytest.approx(fixed(unknowns).value, rel=1e-9)
+    assert frozen(away).value == pytest.approx(fixed(away).value, rel=1e-9)
+    assert frozen(unknowns).value == pytest.approx(fixed(unknowns).value, rel=1e-9)
