@@ -13,6 +13,7 @@ from palpate.uncertainty import (
     NORMAL_95,
     Covariance,
     Marginal,
+    ModulusInterval,
     Profile,
     marginals_of,
     modulus_interval,
@@ -23,7 +24,7 @@ from palpate.unknowns import Acts, Alternative, Block, Choice
 BOUNDS = (np.log(0.02), np.log(200.0))
 WIDE = Bounds(np.full(2, BOUNDS[0]), np.full(2, BOUNDS[1]))
 SD = 0.2
-STRAIGHT = Profile(np.array([-2.0, 0.0, 2.0]) * SD + 1.0, np.array([-2.0, 0.0, 2.0]), None, None)
+STRAIGHT = Profile(np.array([-2.0, 0.0, 2.0]) * SD + 1.0, np.array([-2.0, 0.0, 2.0]), 1.0 - 1.96 * SD, 1.0 + 1.96 * SD)
 DRAWS = 200_000
 
 
@@ -42,8 +43,7 @@ def test_the_quantiles_of_one_explanation_are_those_of_its_ellipse_where_its_pro
 
 
 def test_without_a_profile_the_law_is_normal_in_the_logarithm():
-    alone = Profile(np.array([1.0]), np.array([0.0]), None, None)
-    assert ends_of(marginal([1.0], [1.0], [SD], alone)) == pytest.approx(1.0 + NORMAL_95 * SD * np.array([-1.0, 1.0]))
+    assert ends_of(marginal([1.0], [1.0], [SD], None)) == pytest.approx(1.0 + NORMAL_95 * SD * np.array([-1.0, 1.0]))
 
 
 def test_the_quantiles_of_one_explanation_are_the_ends_of_its_profile(objective, minimum):
@@ -88,10 +88,17 @@ def test_an_end_beyond_the_bounds_is_open():
     assert far.interval((-1.0, 2.5)) == (pytest.approx(np.exp(far.quantile(0.025, BOUNDS)), rel=1e-5), None)
 
 
+def test_an_end_beyond_where_the_profile_could_be_followed_is_open():
+    lost = replace(STRAIGHT, theta=STRAIGHT.theta[:2], root=STRAIGHT.root[:2], high=None)
+    low, high = marginal([1.0], [1.0], [SD], lost).interval(BOUNDS)
+    assert low == pytest.approx(np.exp(1.0 - NORMAL_95 * SD), rel=1e-4)
+    assert high is None
+
+
 def curved():
     """A profile of a law that leans: r = 2 sinh(x / 2 sd) on the way up, half of it on the way down."""
     x = np.linspace(-3.0, 3.0, 61) * SD
-    return Profile(x, np.where(x < 0.0, 0.5, 1.0) * 2.0 * np.sinh(0.5 * x / SD), None, None)
+    return Profile(x, np.where(x < 0.0, 0.5, 1.0) * 2.0 * np.sinh(0.5 * x / SD), -2.0 * SD, 1.7 * SD)
 
 
 def test_the_coordinate_is_the_profile_and_rises_on_beyond_its_ends():
@@ -208,8 +215,10 @@ def test_shares_add_to_1_where_several_causes_disagree():
 
 def test_each_parameter_has_its_own_marginal():
     found = stated_mixture(explained(ALONE), causes(), BLOCKS)
-    profiles = tuple(replace(STRAIGHT, theta=STRAIGHT.theta - 1.0 + theta) for theta in ALONE[2])
-    for i, of in enumerate(marginals_of(found, profiles)):
-        assert of.theta == pytest.approx([ALONE[2][i]])
-        assert of.sd == pytest.approx([np.sqrt(found.covariance.total[i, i])])
-        assert of.spread == of.sd[0]
+    for kind, known in (("linearised", False), ("profile", True)):
+        own = [ModulusInterval((None, None), kind, STRAIGHT)] * 2
+        for i, of in enumerate(marginals_of(found, own)):
+            assert of.theta == pytest.approx([ALONE[2][i]])
+            assert of.sd == pytest.approx([np.sqrt(found.covariance.total[i, i])])
+            assert of.spread == of.sd[0]
+            assert (of.profile is STRAIGHT) is known

@@ -68,8 +68,9 @@ def methods_text(data: ReportData) -> Methods:
             f" {len(data.document['starts'])} starts by Gauss-Newton steps in a trust region {cite('nocedal')}, on a"
             f" reduced basis whose error was bounded at the estimate {cite('reduced')}."
             f"{onwards if law is not None and law.finite else ''} The posterior was a mixture over explanations of the"
-            " images: how patchy the tissues are, layers around organs, in each later image the frame's motion and how"
-            " surfaces are drawn. Each had its own minimum, and the weight of its evidence in Laplace's approximation."
+            " images: how patchy the tissues are, layers around organs, in each of the later images the frame's motion"
+            " and how surfaces are drawn. Each had its own minimum, and the weight of its evidence in Laplace's"
+            " approximation."
         ),
         (
             "Values are medians of this mixture, 95 % intervals its equal-tailed quantiles. Its spread was widened by"

@@ -11,7 +11,7 @@ from scipy import optimize, special
 
 from palpate.inversion import Mixture
 from palpate.uncertainty.covariance import Covariance
-from palpate.uncertainty.intervals import Interval
+from palpate.uncertainty.intervals import Interval, ModulusInterval
 from palpate.uncertainty.profile import Profile
 from palpate.unknowns import Block, Choice
 
@@ -113,21 +113,22 @@ class Marginal:
     """The posterior of one log-modulus: a mixture of laws that are normal in the coordinate of a profile.
 
     weights, theta, sd (k,) of the explanations; profile: of the likeliest one, whose signed root deviance r is a
-    coordinate in which that one's posterior is normal, where ln E is none; spread: its standard deviation.
+    coordinate in which that one's posterior is normal, where ln E is none; None where ln E is; spread: its standard
+    deviation.
     """
 
     weights: NDArray[np.float64]
     theta: NDArray[np.float64]
     sd: NDArray[np.float64]
-    profile: Profile
+    profile: Profile | None
     spread: float
 
     def coordinate(self, theta: NDArray[np.float64] | float) -> NDArray[np.float64]:
         """The coordinate (n,) of ln E, as long as ln E at the estimate: the spread times r, beyond its ends a line."""
-        places, roots = self.profile.theta, np.maximum.accumulate(self.profile.root)
         there = np.atleast_1d(np.asarray(theta, dtype=np.float64))
-        if len(places) < 2:
+        if self.profile is None or len(self.profile.theta) < 2:
             return np.asarray(there - self.theta[0])
+        places, roots = self.profile.theta, np.maximum.accumulate(self.profile.root)
         found = self.spread * np.interp(there, places, roots)
         for end, side, inner in ((0, there < places[0], 1), (-1, there > places[-1], -2)):
             steps = places[end] - places[inner]
@@ -160,15 +161,22 @@ class Marginal:
         return float(optimize.brentq(excess, low, high, xtol=1e-6))
 
     def interval(self, bounds: tuple[float, float]) -> Interval:
-        """The equal-tailed 95 % interval of E as a ratio to the scale; an end beyond the bounds is open."""
+        """The equal-tailed 95 % interval of E as a ratio to the scale.
+
+        An end is open beyond the bounds, and beyond the places to which the profile could be followed.
+        """
         low, high = self.quantile(TAIL, bounds), self.quantile(1.0 - TAIL, bounds)
+        if self.profile is not None:
+            first, last = float(self.profile.theta[0]), float(self.profile.theta[-1])
+            low = None if low is None or (self.profile.low is None and low < first) else low
+            high = None if high is None or (self.profile.high is None and high > last) else high
         return (None if low is None else float(np.exp(low)), None if high is None else float(np.exp(high)))
 
 
-def marginals_of(stated: StatedMixture, profiles: tuple[Profile, ...]) -> tuple[Marginal, ...]:
-    """That of each parameter, by the `profiles` of the likeliest explanation."""
+def marginals_of(stated: StatedMixture, intervals: Sequence[ModulusInterval]) -> tuple[Marginal, ...]:
+    """That of each parameter, by the `intervals` of the likeliest explanation: by their profiles where these lean."""
     found = []
-    for i, profile in enumerate(profiles):
-        sd = np.sqrt(stated.covariances[:, i, i])
+    for i, of in enumerate(intervals):
+        sd, profile = np.sqrt(stated.covariances[:, i, i]), of.profile if of.kind == "profile" else None
         found.append(Marginal(stated.weights, stated.theta[:, i], sd, profile, float(sd[0])))
     return tuple(found)
