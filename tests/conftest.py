@@ -31,7 +31,7 @@ from palpate.study import run
 from palpate.study.case import Case, CaseTissue, Estimate, Images
 from palpate.study.case_file import read_case
 from palpate.study.check import check_case
-from palpate.study.estimated import Estimation, Iteration, ModulusEstimate, Start, TissueFit
+from palpate.study.estimated import Estimation, Iteration, ModulusEstimate, Start, StatedExplanation, TissueFit
 from palpate.study.result import CaseResult, MeshSummary, Provenance
 from palpate.study.samples import ModulusSamples
 from palpate.uncertainty import Covariance
@@ -169,6 +169,15 @@ def make_estimation(displacement: np.ndarray) -> Estimation:
         counts={"forward": 3, "adjoint": 0, "tangent": 2, "factorisations": 4, "evaluations": 9},
         remarks=(Finding("example", "a warning to be shown"),),
         observations={"surface distance": "the distance between surfaces"},
+        explanations=(
+            StatedExplanation(("patchy", "bonded"), (("frame moves",),), 0.8, {"prostate": 58.0, "bladder": 31.5}),
+            StatedExplanation(
+                ("nearly homogeneous", "layers"),
+                (("frame still", "bladder drawn otherwise"),),
+                0.2,
+                {"prostate": 64.0, "bladder": 29.0},
+            ),
+        ),
     )
 
 
@@ -194,9 +203,14 @@ def case_result() -> CaseResult:
 @pytest.fixture(scope="session")
 def sampled_result(case_result) -> CaseResult:
     """The same with draws of the moduli."""
-    normal = np.random.default_rng(5).standard_normal((600, 2))
+    normal = np.random.default_rng(5).standard_normal((150, 2))
     moduli = np.array([58.9, 31.2]) * np.exp(np.array([0.1, 0.245]) * normal)
-    samples = ModulusSamples(("prostate", "bladder"), "kPa", moduli, np.array([[48.0, 71.0], [19.0, np.nan]]))
+    samples = ModulusSamples(
+        ("prostate", "bladder"),
+        "kPa",
+        moduli,
+        np.array([[48.0, 71.0], [19.0, np.nan]]),
+    )
     case = dataclasses.replace(case_result.case, estimate=Estimate(samples=150))
     estimation = dataclasses.replace(case_result.estimation, samples=samples)
     return dataclasses.replace(case_result, case=case, estimation=estimation)

@@ -81,9 +81,7 @@ def test_moduli_that_depend_on_each_other_are_one_warning_with_every_pair():
     inversion = Stand(
         objective=Stand(parameters=Stand(absolute=True, tissues=names, names=names)),
         minimum=Stand(converged=True),
-        convergence=Stand(unmet=()),
-        unsettled="",
-        candidates=[Stand(minimum=Stand(outcome=None))],
+        mixture=Stand(explanations=(Stand(chosen={}, weight=1.0),)),
     )
     sd = np.array([0.1, 0.2, 0.5])
     correlation = np.array([[1.0, -0.995, 0.5], [-0.995, 1.0, 0.992], [0.5, 0.992, 1.0]])

@@ -46,7 +46,6 @@ Misleading = Literal[
     "points-outside",
     "data-misfit",
     "force-reversed",
-    "no-equilibrium",
     "beyond-interval",
 ]
 Widening = Literal[
@@ -61,7 +60,6 @@ Widening = Literal[
     "touching",
 ]
 Harmless = Literal[
-    "samples-not-mixed",
     "frame-aligned",
     "finer-mesh",
     "front-exchanged",

@@ -513,6 +513,23 @@ def test_two_moduli_together_and_what_each_image_says_alone_are_shown_where_they
     assert "could not be drawn" not in page
 
 
+def test_under_which_explanation_what_stands_in_a_table(page, case_result):
+    _, table = page.split("Under which explanation what")
+    _, *rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in table.split("</table>")[0].split("<tr>")[1:]]
+    assert rows == [
+        ["80 %", "patchy tissues and no layers round organs", "frame moves", "58.0", "31.5"],
+        [
+            "20 %",
+            "nearly homogeneous tissues and layers round organs",
+            "frame still and bladder drawn otherwise",
+            "64.0",
+            "29.0",
+        ],
+    ]
+    none = dataclasses.replace(case_result.estimation, explanations=())
+    assert "Under which explanation what" not in words_of(dataclasses.replace(case_result, estimation=none))
+
+
 def test_a_result_of_one_image_says_nothing_of_repeats(page):
     assert "says by itself" not in page
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -72,5 +73,14 @@ def test_results_and_failures_meet_their_schema_key_by_key(case_result, sampled_
     assert errors(RESULT, document) == []
     assert set(RESULT["properties"]) - set(document) == {"pairs", "files"}
     assert errors(RESULT, failure_document(case_result.case, NotConverged("it stopped"))) == []
+    assert document["explanations"][1] == {
+        "probability": 0.2,
+        "scenario": ["nearly homogeneous", "layers"],
+        "images": [{"after": document["fit"][0]["after"], "shows": ["frame still", "bladder drawn otherwise"]}],
+        "moduli": {"prostate": 64.0, "bladder": 29.0},
+    }
+    stopped = replace(case_result, estimation=replace(case_result.estimation, status="not converged"))
+    assert stopped.to_dict()["explanations"] == []
+    assert errors(RESULT, document | {"explanations": [{"probability": 0.5}]})
     assert errors(RESULT, document | {"status": "fine"})
     assert errors(RESULT, document | {"case": {"mesh": {}}, "news": 1})

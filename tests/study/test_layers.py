@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from palpate.inversion.continuation import ended
+from palpate.inversion.trust_region import NEAR
 
 from palpate.errors import NotConverged
 from palpate.inversion import InverseProblem, LaterState, Outcome, OuterIterate, invert, minimised
-from palpate.inversion.continuation import ended
-from palpate.inversion.trust_region import NEAR
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.layers import layer_thickness_mm, layered_space, layers_round_organs

@@ -90,7 +90,7 @@ def test_a_region_reaches_along_each_axis_as_far_as_the_interval_beside_it(found
 def test_samples_have_the_interval_of_the_estimate(found):
     drawn = half_widths(found.samples.interval95)
     assert drawn == pytest.approx(half_widths([e.interval95 for e in found.estimates]), rel=0.1)
-    correlation = np.corrcoef(np.log(found.samples.moduli.reshape(-1, 2)).T)[0, 1]
+    correlation = np.corrcoef(np.log(found.samples.moduli).T)[0, 1]
     assert correlation == pytest.approx(found.correlation[0, 1], abs=0.1)
 
 

@@ -9,12 +9,12 @@ import jsonschema
 import numpy as np
 import pytest
 import referencing
+from palpate.inversion.trust_region import REPORTED
 
 import palpate
 from palpate.cli import main
 from palpate.errors import EstimationError
 from palpate.images.readers import write_label_image
-from palpate.inversion.trust_region import REPORTED
 from palpate.mechanics.dilatation import choose_element
 from palpate.progress import silent
 from palpate.report.tornado import effect_text, sensitivity_page, sensitivity_table, tornado_rows

@@ -11,7 +11,7 @@ from palpate.approximation import exact_approximation, reduced_basis
 from palpate.inversion import Outcome, frozen_posterior, invert
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.stated_posterior import StatedPosterior, exact_at_ends
-from palpate.uncertainty import NORMAL_95, modulus_interval
+from palpate.uncertainty import NORMAL_95, Covariance, StatedMixture, modulus_interval
 
 NOISE = NoiseModel(np.array([0.3**2]), np.array([3.0]))
 
@@ -34,8 +34,11 @@ def poor(inversion, twin):
 
 
 def posterior_of(objective, minimum):
-    covariance = np.linalg.inv(minimum.evaluation.matrix)
-    return StatedPosterior(frozen_posterior(objective, minimum.unknowns), minimum, covariance)
+    covariance = np.linalg.inv(minimum.evaluation.matrix)[:2, :2]
+    zero = np.zeros_like(covariance)
+    alone = np.ones(1), minimum.unknowns[None, :2], covariance[None]
+    mixture = StatedMixture(*alone, Covariance(covariance, zero, zero, zero))
+    return StatedPosterior(frozen_posterior(objective, minimum.unknowns), minimum, mixture)
 
 
 def profiles(posterior, bounds):

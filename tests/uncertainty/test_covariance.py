@@ -19,7 +19,6 @@ from palpate.observation.robust_loss import PowerLaw
 from palpate.phantoms.motion import smooth_field
 from palpate.uncertainty import NORMAL_95, FittedState, gain, sandwich_covariance
 from palpate.uncertainty.covariance import (
-    added_by,
     error_noise,
     grid_covariance,
     grid_position_shifts,
@@ -318,14 +317,3 @@ def test_the_grid_adds_to_stated_noise_and_to_what_residuals_tell_what_that_lack
         for line in told.linearisations
     ]
     assert np.array_equal(grid_covariance(replace(told, linearisations=tuple(lines)), grid, noise), grid)
-
-
-def test_nothing_is_taken_from_what_is_known_of_fewer_unknowns(rng):
-    """What a second fit finds narrower, as one of other residuals may, takes nothing from the first one."""
-    held = np.diag([0.04, 0.04])
-    assert added_by(0.5 * held, held=held) == pytest.approx(np.zeros((2, 2)))
-    assert added_by(np.diag([0.06, 0.01]), held=held) == pytest.approx(np.diag([0.02, 0.0]))
-    wide = rng.standard_normal((2, 2))
-    total = held + added_by(wide @ wide.T, held=held)
-    for less in (held, wide @ wide.T):
-        assert np.linalg.eigvalsh(total - less).min() > -1e-12

@@ -117,8 +117,7 @@ def alone(joint, *, reference=0, **changes):
     inversion, bounds = joint
     first, second = inversion.objective.states
     objective = replace(inversion.objective, states=(first, replace(second, reference=reference)), **changes)
-    (found,) = pair_estimates(objective, inversion.minimum, bounds, errors_of(inversion.minimum.evaluation))
-    return found
+    return pair_estimates(objective, inversion.minimum, bounds, errors_of(inversion.minimum.evaluation))
 
 
 def test_every_pair_says_alone_what_it_says_and_their_mean_is_near_the_joint_estimate(joint, by_first):
@@ -167,7 +166,7 @@ def test_the_place_of_the_grid_counts_in_every_pair(joint, rng):
     inversion, bounds = joint
     evaluation = inversion.minimum.evaluation
     without, with_it = (
-        pair_estimates(inversion.objective, inversion.minimum, bounds, errors_of(evaluation, rng, size))[0]
+        pair_estimates(inversion.objective, inversion.minimum, bounds, errors_of(evaluation, rng, size))
         for size in (0.0, 10.0)
     )
     added = with_it.covariance - without.covariance

@@ -200,7 +200,7 @@ def _add_estimates(subparsers: Any) -> None:
     _add_overwrite(estimate)
     estimate.set_defaults(targets=written.TARGETS)
     _add_set(estimate)
-    what = "draw N samples of the posterior of the moduli in each of 4 chains, as posterior.nc (extra `samples`)"
+    what = "draw N samples of the posterior of the moduli, as posterior.nc (extra `samples`)"
     estimate.add_argument("--samples", type=_samples, action="append", dest="set", default=[], metavar="N", help=what)
     what = "estimate a case, then again under changed assumptions; an interrupted run continues"
     sensitivity = _command(subparsers, "sensitivity", written.sensitivity, what=what)

@@ -37,7 +37,7 @@ TISSUES = (
 
 
 def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
-    """Write tissues.csv, groups.csv and samples.csv (chain, draw, tissue, youngs_modulus); no value: empty."""
+    """Write tissues.csv, groups.csv and samples.csv (draw, tissue, youngs_modulus); no value: empty."""
     areas = []
     for group in face_groups(body.mesh):
         area = float(np.linalg.norm(triangle_normals(body.mesh.nodes, group.triangles), axis=1).sum())
@@ -58,8 +58,8 @@ def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
     _table(folder / "tissues.csv", TISSUES, tissues)
     _table(folder / "groups.csv", ("group", "faces", "area_before_mm2"), areas)
     samples = moduli_samples(model)
-    rows = ((*place[:2], samples.tissues[place[2]], _number(value)) for place, value in np.ndenumerate(samples.moduli))
-    _table(folder / "samples.csv", ("chain", "draw", "tissue", "youngs_modulus"), rows)
+    rows = ((place[0], samples.tissues[place[1]], _number(value)) for place, value in np.ndenumerate(samples.moduli))
+    _table(folder / "samples.csv", ("draw", "tissue", "youngs_modulus"), rows)
 
 
 def _number(value: float | None) -> str:

@@ -77,7 +77,7 @@ class FittedModel:
 
     moduli (n_tissues,) in `unit`, "kPa" or "ratio" to `relative_to`; NaN of hollow tissues; covariance (n, n) of the
     natural logarithms of the `estimates`; law_parameters, element, outer_boundary, densities (n_tissues,), in
-    kg/m^3: as the case has them; seal: SHA-256 of the numbers of the result.json beside it; samples: chains of the
+    kg/m^3: as the case has them; seal: SHA-256 of the numbers of the result.json beside it; samples: draws of the
     moduli's posterior, where the case asked for them; strained: whether the reference state is not free of stress.
     """
 

@@ -15,47 +15,35 @@ from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.study.outputs import write_bytes
 from palpate.study.samples import POSTERIOR
 
-DRAWS = 1000
+DRAWS = 4000
 SEED = 0
 LINEARISED = "linearised: independent draws, log-normal about the estimate"
-SAMPLED = "sampled: Markov chains around the estimate, stretched to the covariance of its interval"
+SAMPLED = "sampled: independent draws of the posterior, over all explanations of the images"
 PROBABILITY = 0.95
 
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """moduli (chains, draws, n) of n `tissues` in the model's unit; kind: what they are, in words.
-
-    log_density (chains, draws): of their logarithms; of chains, of all unknowns and but for a constant.
-    """
+    """Independent moduli (draws, n) of n `tissues` in the model's unit; kind: what they are, in words."""
 
     tissues: tuple[str, ...]
     moduli: NDArray[np.float64]
-    log_density: NDArray[np.float64] | None
     kind: str
 
 
 def moduli_samples(model: FittedModel) -> Samples:
-    """The model's own chains; without any, draws with ln E normal about the estimates under their covariance.
-
-    The latter are independent, in chains for programs that compare chains.
-    """
+    """The model's own draws; without any, draws with ln E normal about the estimates under their covariance."""
     if model.samples is not None:
-        found = model.samples
-        return Samples(found.tissues, found.moduli[None], None, SAMPLED)
+        return Samples(model.samples.tissues, model.samples.moduli, SAMPLED)
     centre = np.log([item.value if model.unit == "kPa" else item.ratio for item in model.estimates])  # type: ignore
-    n = len(centre)
-    normal = np.random.default_rng(SEED).standard_normal((1, DRAWS, n))
+    normal = np.random.default_rng(SEED).standard_normal((DRAWS, len(centre)))
     values, vectors = np.linalg.eigh(model.covariance)
-    spread = np.sqrt(np.maximum(values, 0.0))
-    logarithms = centre + (normal * spread) @ vectors.T
-    scale = float(np.log(spread[spread > 0.0]).sum()) + 0.5 * n * np.log(2.0 * np.pi)
-    density = -0.5 * (normal**2).sum(axis=2) - scale
-    return Samples(tuple(item.tissue for item in model.estimates), np.exp(logarithms), density, LINEARISED)
+    logarithms = centre + (normal * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return Samples(tuple(item.tissue for item in model.estimates), np.exp(logarithms), LINEARISED)
 
 
 def write(model: FittedModel, body: FittedBody, folder: Path) -> None:
-    """Write posterior.nc: groups posterior, sample_stats, constant_data; `ResourceError` without the extra `netcdf`."""
+    """Write posterior.nc: groups posterior and constant_data; `ResourceError` without the extra `netcdf`."""
     del body
     write_posterior(model, folder / POSTERIOR)
 
@@ -70,26 +58,25 @@ def write_posterior(model: FittedModel, path: Path) -> None:
             " holds the same samples"
         ) from error
     samples, unit = moduli_samples(model), "kPa" if model.unit == "kPa" else f"ratio to {model.relative_to}"
-    chains, draws, n = samples.moduli.shape
+    draws, n = samples.moduli.shape
     memory = io.BytesIO()
     with h5netcdf.File(memory, "w") as file:
         file.attrs["created_by"] = "Palpate"
-        for name in ("posterior", "sample_stats", "constant_data"):
+        for name in ("posterior", "constant_data"):
             group = file.create_group(name)
-            axes = {} if name == "constant_data" else {"chain": chains, "draw": draws}
+            axes = {} if name == "constant_data" else {"chain": 1, "draw": draws}  # independent: they are one chain
             group.dimensions = {"tissue": n, **axes}
             tissue = group.create_variable("tissue", ("tissue",), h5netcdf.core.h5py.string_dtype())
             tissue[:] = np.array(samples.tissues, dtype=object)
             for axis, count in axes.items():
                 group.create_variable(axis, (axis,), data=np.arange(count))
-        moduli = file["posterior"].create_variable("youngs_modulus", ("chain", "draw", "tissue"), data=samples.moduli)
+        of_draws = ("chain", "draw", "tissue")
+        moduli = file["posterior"].create_variable("youngs_modulus", of_draws, data=samples.moduli[None])
         moduli.attrs["units"], moduli.attrs["kind"] = unit, samples.kind
-        if samples.log_density is not None:
-            file["sample_stats"].create_variable("lp", ("chain", "draw"), data=samples.log_density)
         given = [item.interval95 if model.unit == "kPa" else item.ratio_interval95 for item in model.estimates]
         ends = np.array([[np.nan if end is None else end for end in pair or (None, None)] for pair in given])
         constants = {"interval95_low": ends[:, 0], "interval95_high": ends[:, 1]}
-        if model.samples is not None:
+        if model.samples is not None:  # their own intervals
             own = model.samples.interval95
             constants |= {"samples_interval95_low": own[:, 0], "samples_interval95_high": own[:, 1]}
         for name, values in constants.items():

@@ -33,7 +33,10 @@ def alternatives_of(blocks: Sequence[Block], state: int) -> tuple[Alternatives, 
     """What may be in one later image: how its frame moves, and which of its surfaces are drawn otherwise."""
     own = [i for i, block in enumerate(blocks) if block.states == (state,)]
     frames = [
-        [Alternatives(((i, k),), a.log_odds, (a.name,)) for k, a in enumerate(blocks[i].alternatives)]
+        [
+            Alternatives(((i, k),), a.log_odds, (f"{blocks[i].of} {a.name}",))
+            for k, a in enumerate(blocks[i].alternatives)
+        ]
         for i in own
         if blocks[i].choice is Choice.FRAME
     ]

@@ -31,7 +31,7 @@ from palpate.report.methods import methods_text
 from palpate.report.payload import payload
 from palpate.report.pictures import mesh_png, organs_png, points_png
 from palpate.report.report_data import LaterImage, MeasuredState, ReportData, SliceBox, TissueMap
-from palpate.report.rows import estimate_rows, headline, moduli_in, ratio_rows, scale_marks
+from palpate.report.rows import estimate_rows, explanation_rows, headline, moduli_in, ratio_rows, scale_marks
 from palpate.report.scales import angle_scale, displacement_scale, distance_scale, modulus_scale, strain_scale
 from palpate.report.section import VIEWS, Plane
 from palpate.report.slices import (
@@ -121,6 +121,7 @@ def render(data: ReportData, *, study: bool = False) -> str:
         live=live if scripts else None,
         rows=estimate_rows(data.document, colours),
         ratios=ratio_rows(data.document),
+        explanations=explanation_rows(data.document),
         marks=scale_marks(data.document),
         starts=_starts(data.document),
         warnings=_warnings(data),

@@ -10,7 +10,7 @@ from typing import Any
 from palpate.report.ticks import log_marks, mark_text
 from palpate.report.units import ModulusUnit, shown_unit
 from palpate.uncertainty import NORMAL_95, Interval
-from palpate.unknowns import FIELD, KNOWN_MODULUS
+from palpate.unknowns import FIELD, KNOWN_MODULUS, PATCHINESS
 
 NONE = "–"
 BELIEVED = "what was believed before"
@@ -26,9 +26,15 @@ CAUSES = {
     "poisson": "Poisson's ratios",
     "instrument": "the instruments' offsets",
     KNOWN_MODULUS: "the range of the known modulus",
+    "minima": "several minima",
     "prior": "what is believed of parameters",
     "grid": "the voxels' place",
     "mesh": "the mesh",
+}
+SCENARIOS = {
+    **{level: f"{level} tissues" for level in PATCHINESS},
+    "bonded": "no layers round organs",
+    "layers": "layers round organs",
 }
 MOST_CAUSES = 4  # of a bar; the smaller ones together are the last
 OTHERS = "others"
@@ -111,6 +117,16 @@ class RatioRow:
     why: str
 
 
+@dataclass(frozen=True, slots=True)
+class ExplanationRow:
+    """One explanation of the later images, as texts: its probability, the tissues, each image, and moduli by tissue."""
+
+    probability: str
+    scenario: str
+    images: tuple[tuple[str, str], ...]
+    moduli: tuple[tuple[str, str], ...]
+
+
 def number(value: float | None, *, digits: int = 3) -> str:
     """`value` with so many significant digits, without exponent where it can be read; a dash for nothing."""
     if value is None or not math.isfinite(value):
@@ -141,6 +157,20 @@ def ratio_rows(document: Mapping[str, Any]) -> tuple[RatioRow, ...]:
         )
         for item in document["estimates"]
         if item["parameter"] == "poisson_ratio"
+    )
+
+
+def explanation_rows(document: Mapping[str, Any]) -> tuple[ExplanationRow, ...]:
+    """A row for each explanation of a result document, with moduli in the unit that is shown."""
+    unit = shown_unit(document)
+    return tuple(
+        ExplanationRow(
+            _percent(of["probability"]),
+            listed([SCENARIOS.get(word, word) for word in of["scenario"]]) or NONE,
+            tuple((image["after"], listed(image["shows"]) or NONE) for image in of["images"]),
+            tuple((tissue, number(unit.of_document(value))) for tissue, value in of["moduli"].items()),
+        )
+        for of in document.get("explanations", ())
     )
 
 
@@ -345,7 +375,7 @@ def _of_starts(minima: Sequence[int | None]) -> list[str]:
     if n < 2:
         return []
     if (answers := len(set(led))) > 1:
-        return [f"The search from {n} starts led to {answers} different answers; the best one is shown."]
+        return [f"The search from {n} starts led to {answers} different answers; the result weighs them."]
     if len(led) == n:
         return [f"The search led to the same answer from all {n} starts."]
     return [f"The search led to an answer from {len(led)} of {n} starts; the others stopped, or fitted worse."]

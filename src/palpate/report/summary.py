@@ -121,8 +121,8 @@ def _sure(document: Mapping[str, Any], unit: ModulusUnit) -> Iterator[str]:
     minima = {start["minimum"] for start in document["starts"] if start["minimum"] is not None}
     if len(minima) > 1:
         yield (
-            f"The search found {len(minima)} different answers. The best one is shown; the ranges include those that"
-            " fit nearly as well."
+            f"The search found {len(minima)} different answers. The ranges include all that explain the images about as"
+            " well."
         )
 
 

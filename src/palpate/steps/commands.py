@@ -140,8 +140,8 @@ def estimate(
 ) -> CaseResult:
     """The Young's modulus of every `estimate` tissue of a case, with its interval and its verdict.
 
-    samples: draws of the moduli's posterior in each of four chains, 100 to 100 000 (extra `samples`), in the place of
-    the case's own [estimate] samples; truth: true moduli (kPa) by tissue, to stand beside the estimates of a
+    samples: draws of the moduli's posterior, 100 to 100 000 (extra `samples`), in the place of the case's own
+    [estimate] samples; truth: true moduli (kPa) by tissue, to stand beside the estimates of a
     simulation; a phantom brings its own; progress: "auto" shows stages with a bar in a notebook and on a terminal, True
     everywhere, None or False nowhere; a function is called with each sentence. Raises as `make_mesh` does,
     `ConfigurationError` for another number of samples, `ResourceError` where the libraries for them are not installed,

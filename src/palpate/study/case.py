@@ -22,7 +22,7 @@ SOLVER_NAMES = ("auto", *SOLVERS)
 POSITIVE_NUMBERS = "a list of positive numbers"
 LOW_HIGH = "[low, high] with low < high"
 RATIOS = (1e-6, 1e6)
-SAMPLES = (100, 100_000)  # draws of a chain: with fewer nothing is told of the tails, more take hours
+SAMPLES = (100, 100_000)  # draws: fewer tell nothing of the tails, and more tell no more
 SOUGHT_RATIOS = (0.02, 0.4995)  # between which a Poisson's ratio is searched
 
 
@@ -127,8 +127,8 @@ class Noise:
 class Estimate:
     """How the unknowns are found; starts and bounds to the `known` tissue, or in kPa where these are given.
 
-    `parameters`: what is sought of every `estimate` tissue; `samples`: draws of the moduli's posterior in each of four
-    chains; 0: none.
+    `parameters`: what is sought of every `estimate` tissue; `samples`: draws of the moduli's posterior; 0:
+    none.
     """
 
     method: str = field(default="gauss-newton", metadata=rule(choices=("gauss-newton", "lbfgs")))
@@ -163,8 +163,8 @@ class Estimate:
             )
         if self.samples and not SAMPLES[0] <= self.samples <= SAMPLES[1]:
             raise ConfigurationError(
-                f"[estimate] samples is {self.samples}; ask for {SAMPLES[0]} to {SAMPLES[1]} draws in each chain (1000"
-                " are usually enough), or 0 for none"
+                f"[estimate] samples is {self.samples}; ask for {SAMPLES[0]} to {SAMPLES[1]} draws (4000 are"
+                " usually enough), or 0 for none"
             )
         for starts, bounds, name in (
             (self.start_ratios, self.bounds_ratio, "start_ratios"),

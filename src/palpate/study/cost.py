@@ -35,7 +35,6 @@ ASSEMBLING = 0.23  # of that: distances to the surfaces and stiffness matrices
 FINITE_STRAIN_S = 3.6e-4  # the same of equilibria and their derivatives at finite strain
 INTERVALS_S = 2.2e-4  # the same of intervals, and of what would change the answer
 FROM_REST = 2  # further passes, each with a linear one, where the state without loads is found with the moduli
-SECONDS_A_DRAW = 0.039  # of the posterior, in four chains, with 90 modes, for each later image
 SECONDS_A_CUT = 1.0e-4  # of meshing, for each tetrahedron and each tissue that is cut out
 PARALLEL_SHARE = 0.3  # share of the time that more processors shorten
 FIXED_GB = 0.48
@@ -148,7 +147,6 @@ def cost_of_meshes(
         if case.strained_reference:
             took["check the law"] += FROM_REST * (SECONDS_AN_UNKNOWN + FINITE_STRAIN_S) * work * shorter
         took["intervals"] += INTERVALS_S * work * shorter
-        took["intervals"] += SECONDS_A_DRAW * case.estimate.samples * modes * max(n_after, 1)
         gigabytes += GB_AN_UNKNOWN * work + solving.bytes / 1e9
     return ExpectedCost(
         tets=sum(tets for tets, _ in meshes),

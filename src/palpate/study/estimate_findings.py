@@ -56,10 +56,10 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
     sd = np.sqrt(np.diag(covariance))
     pairs = np.argwhere(np.tril(np.abs(covariance) > STRONG_CORRELATION * np.outer(sd, sd), -1)).tolist()
     if pairs:
-        alike = [f"'{mapping.names[j]}' and '{mapping.names[i]}'" for i, j in pairs]
+        both = [f"'{mapping.names[j]}' and '{mapping.names[i]}'" for i, j in pairs]
         what = "moduli" if np.max(pairs) < len(mapping.tissues) else "parameters"
         rest = ". Add images in which they move differently, or join them."
-        text = listing(f"These data cannot separate the {what} of ", alike, rest)
+        text = listing(f"These data cannot separate the {what} of ", both, rest)
         findings.append(Finding("correlated", text))
     return tuple(findings)
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.findings import Finding
-from palpate.inversion import Explanation
 from palpate.observation.contract import Fit, PointMotions
 from palpate.study.discrepancy import FittedMaterial, FoundDiscrepancy
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate
@@ -112,6 +111,19 @@ class PointFit:
 
 
 @dataclass(frozen=True, slots=True)
+class StatedExplanation:
+    """One of the explanations of all later images: its probability, and the moduli (kPa, or ratios) under it.
+
+    scenario: what is so of all tissues, images: what is so in each later image, in words.
+    """
+
+    scenario: tuple[str, ...]
+    images: tuple[tuple[str, ...], ...]
+    probability: float
+    moduli: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
 class Estimation:
     """Result of one inversion.
 
@@ -126,7 +138,7 @@ class Estimation:
     image_pairs: what each of several later images says alone; samples: of the moduli's posterior,
     where the case asks for them and the estimate converged; variations: what would change the answer; maps: of tissues
     whose modulus is a field; materials: of the elements, one for each later state;
-    explanations: of which the posterior is a mixture.
+    explanations: the likelier ones of those of which the posterior is a mixture.
     """
 
     status: str
@@ -153,7 +165,7 @@ class Estimation:
     variations: tuple[Variation, ...] = ()
     maps: tuple[StiffnessMap, ...] = ()
     materials: tuple[FittedMaterial, ...] = ()
-    explanations: tuple[Explanation, ...] = ()
+    explanations: tuple[StatedExplanation, ...] = ()
 
     @property
     def correlation(self) -> NDArray[np.float64]:

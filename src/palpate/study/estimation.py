@@ -21,7 +21,7 @@ from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, se
 from palpate.progress import Progress, silent
 from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of, fitted_materials
 from palpate.study.estimate_findings import data_findings, fold_findings, inversion_findings, pair_findings
-from palpate.study.estimated import Estimation, ForceFit, Iteration, PointFit, Start, TissueFit
+from palpate.study.estimated import Estimation, ForceFit, Iteration, PointFit, Start, StatedExplanation, TissueFit
 from palpate.study.map_words import map_findings
 from palpate.study.misfit import beside_misfits, misfits_of
 from palpate.study.poisson_ratios import NOT_IDENTIFIED
@@ -38,6 +38,8 @@ from palpate.uncertainty import (
     information_shares,
     stiffness_maps,
 )
+
+LEAST_TOLD = 0.01  # probability of an explanation that the result names
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +62,7 @@ def conclude(
 ) -> Estimation:
     """State the result of an inversion; `truth`: true moduli (kPa) by tissue where they are known.
 
-    samples: draws in each chain of the moduli's posterior, where the estimate converged; 0: none.
+    samples: draws of the moduli's posterior, where the estimate converged; 0: none.
     The covariance is the sandwich under the residuals' noise model plus the scatter over grid positions.
     """
     objective, minimum = inversion.objective, inversion.minimum
@@ -128,7 +130,7 @@ def conclude(
         image_pairs=pairs,
         samples=drawn,
         maps=maps,
-        explanations=inversion.mixture.explanations,
+        explanations=_explanations(inversion) if minimum.converged else (),
         materials=fitted_materials(inversion),
     )
 
@@ -162,6 +164,15 @@ def _start(inversion: Inversion, start: StartRun) -> Start:
 
 def _iteration(inversion: Inversion, iterate: Iterate) -> Iteration:
     return Iteration(iterate.misfit_mm2, _moduli(inversion, iterate.theta), iterate.decrement)
+
+
+def _explanations(inversion: Inversion) -> tuple[StatedExplanation, ...]:
+    """Those with a probability of `LEAST_TOLD` at least, the likeliest first."""
+    return tuple(
+        StatedExplanation(of.scenario, of.images, of.weight, _moduli(inversion, of.theta))
+        for of in inversion.mixture.explanations
+        if of.weight >= LEAST_TOLD
+    )
 
 
 def _moduli(inversion: Inversion, theta: NDArray[np.float64]) -> dict[str, float]:

@@ -25,7 +25,7 @@ from palpate.study.case_file import case_tables
 from palpate.study.case_tissue import CaseTissue
 from palpate.study.discrepancy import FoundDiscrepancy
 from palpate.study.edge_length import EdgeLength
-from palpate.study.estimated import Estimation, ModulusEstimate, no_estimate
+from palpate.study.estimated import Estimation, ModulusEstimate, StatedExplanation, no_estimate
 from palpate.study.map_words import map_words
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
 from palpate.study.provenance import image_names
@@ -180,6 +180,9 @@ class CaseResult:
             "combinations": [_plain(pair) for pair in estimation.combinations],
             "regions": [_plain(region) for region in estimation.regions],
             "image_pairs": pairs and _plain(pairs) | {"alone": alone},
+            "explanations": [
+                _explanation(of, names) for of in (estimation.explanations if estimation.status == "converged" else ())
+            ],
             "samples": drawn and drawn.to_dict(),
             "alignment": [found.row(name) for name, found in zip(names, self.every_alignment, strict=False)],
             "fit": [
@@ -302,6 +305,7 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
         "combinations": [],
         "regions": [],
         "image_pairs": None,
+        "explanations": [],
         "samples": None,
         "alignment": [],
         "fit": [],
@@ -391,6 +395,12 @@ def _ratio(item: PoissonRatioEstimate, status: str) -> dict[str, Any]:
     if status != "converged":
         document |= dict.fromkeys(("value", "interval95")) | {"verdict": NOT_IDENTIFIED}
     return document
+
+
+def _explanation(of: StatedExplanation, names: Sequence[str]) -> dict[str, Any]:
+    """One entry of "explanations", with the later images by their names."""
+    images = [{"after": name, "shows": list(words)} for name, words in zip(names, of.images, strict=False)]
+    return {"probability": of.probability, "scenario": list(of.scenario), "images": images, "moduli": dict(of.moduli)}
 
 
 def _map(of: StiffnessMap, names: Sequence[str]) -> dict[str, Any]:

@@ -71,20 +71,20 @@ def intervals_of(inversion: Inversion, settings: InversionSettings, posterior: S
     n, bounds, variances = inversion.objective.n_parameters, settings.bounds, np.diag(posterior.covariance)
     at_bound = bounds.reached(posterior.minimum.unknowns[:n])
 
-    def interval(number: int) -> ModulusInterval:
+    def of_one(number: int) -> ModulusInterval:
         """That of one parameter by the likeliest explanation."""
         variance = float(variances[number])
         return modulus_interval(posterior.frozen, posterior.minimum, number, variance=variance, bounds=bounds)
 
-    every = mapped(interval, range(n))
-    marginals, found = marginals_of(posterior.mixture, tuple(of.profile for of in every)), list[Known]()
+    every = mapped(of_one, range(n))
+    marginals, found = marginals_of(posterior.mixture, every), list[Known]()
     for i, (own, marginal) in enumerate(zip(every, marginals, strict=True)):
         ends = float(bounds.lower[i]), float(bounds.upper[i])
         middle = marginal.quantile(0.5, ends)
         theta = float(inversion.mixture.mean[i]) if middle is None else middle
-        found.append(
-            Known(theta, marginal, own, marginal.interval(ends), bool(at_bound[i]), len(own.profile.theta) > 1)
-        )
+        followed = len(own.profile.theta) > 1
+        interval = marginal.interval(ends) if followed else (None, None)
+        found.append(Known(theta, marginal, own, interval, bool(at_bound[i]), followed))
     return tuple(found)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy import optimize, special
 
 from palpate.inversion import Mixture
 from palpate.uncertainty.covariance import Covariance
-from palpate.uncertainty.intervals import Interval
+from palpate.uncertainty.intervals import Interval, ModulusInterval
 from palpate.uncertainty.profile import Profile
 from palpate.unknowns import Block, Choice
 
@@ -59,38 +59,52 @@ def stated_mixture(mixture: Mixture, own: Covariance, blocks: tuple[Block, ...])
     within = np.tensordot(weights, every, axes=1)
     scale = np.sqrt(np.diag(within) / sandwich)
     scaled = np.outer(scale, scale)
-    between, causes = _between(mixture, blocks), dict[str, NDArray[np.float64]]()
+    between, causes = _between(mixture), dict[str, NDArray[np.float64]]()
     for cause, part in own.causes.items():
         of_held = own.held.get(cause, np.zeros_like(part))
         causes[cause] = (part - of_held) * scaled + of_held
-    for cause, part in between.items():
+    for cause, part in _causes_between(mixture, between, blocks).items():
         causes[cause] = causes.get(cause, np.zeros_like(part)) + part
-    prior = (own.prior - held) * scaled + held + sum(between.values(), np.zeros_like(own.prior))
+    prior = (own.prior - held) * scaled + held + between
     whole = replace(own, noise=own.noise * scaled, prior=prior, causes=causes)
     return StatedMixture(weights, theta, every + further, whole)
 
 
-def _between(mixture: Mixture, blocks: tuple[Block, ...]) -> Mapping[str, NDArray[np.float64]]:
-    """Covariance (n, n) between explanations, by the causes of the blocks whose alternatives distinguish them."""
-    theta, weights = np.stack([of.theta for of in mixture.explanations]), mixture.weights
-    away = theta - mixture.mean
-    whole, parts = (away.T * weights) @ away, dict[str, NDArray[np.float64]]()
+def _between(mixture: Mixture) -> NDArray[np.float64]:
+    """Covariance (n, n) of theta between explanations."""
+    away = np.stack([of.theta for of in mixture.explanations]) - mixture.mean
+    return np.asarray((away.T * mixture.weights) @ away)
+
+
+def _causes_between(
+    mixture: Mixture, between: NDArray[np.float64], blocks: tuple[Block, ...]
+) -> Mapping[str, NDArray[np.float64]]:
+    """Parts (n, n) of what is `between` explanations, by the causes of the blocks whose alternatives distinguish them.
+
+    A part has the share of each variance that the means of explanations with the same alternatives of these blocks
+    have, over the sum of all parts. What none of them tells apart are minima.
+    """
+    weights, away = mixture.weights, np.stack([of.theta for of in mixture.explanations]) - mixture.mean
+    parts, tiny = dict[str, NDArray[np.float64]](), np.finfo(float).tiny
+
+    def means(keys: Sequence[object]) -> NDArray[np.float64]:
+        """The mean (k, n) of all explanations with the same key, of each."""
+        alike = np.array([[one == other for other in keys] for one in keys]) * weights
+        return np.asarray(alike @ away / np.maximum(alike.sum(axis=1, keepdims=True), tiny))
+
     for choice, cause in CAUSES.items():
         own = [i for i, block in enumerate(blocks) if block.choice is choice]
         keys = [tuple(of.chosen.get(i, 0) for i in own) for of in mixture.explanations]
-        means = np.zeros_like(away)
-        for key in set(keys):
-            alike = np.array([each == key for each in keys])
-            means[alike] = weights[alike] @ away[alike] / max(float(weights[alike].sum()), np.finfo(float).tiny)
-        parts[cause] = (means.T * weights) @ means
-    total = np.sqrt(np.maximum(sum(np.diag(part) for part in parts.values()), np.finfo(float).tiny))
-    found = {}
+        if len(set(keys)) > 1:
+            parts[cause] = weights @ means(keys) ** 2
+    chosen = [tuple(sorted(of.chosen.items())) for of in mixture.explanations]
+    if len(set(chosen)) < len(chosen):
+        parts["minima"] = weights @ (away - means(chosen)) ** 2
+    total = np.maximum(sum(parts.values(), np.zeros(away.shape[1])), tiny)
+    found = dict[str, NDArray[np.float64]]()
     for cause, part in parts.items():
-        share = np.sqrt(np.diag(part)) / total
-        found[cause] = whole * np.outer(share, share)
-    rest = whole - sum(found.values(), np.zeros_like(whole))
-    if np.diag(rest).max(initial=0.0) > 0.0:
-        found["minima"] = rest
+        share = np.sqrt(part / total)
+        found[cause] = between * np.outer(share, share)
     return found
 
 
@@ -99,21 +113,22 @@ class Marginal:
     """The posterior of one log-modulus: a mixture of laws that are normal in the coordinate of a profile.
 
     weights, theta, sd (k,) of the explanations; profile: of the likeliest one, whose signed root deviance r is a
-    coordinate in which that one's posterior is normal, where ln E is none; spread: its standard deviation.
+    coordinate in which that one's posterior is normal, where ln E is none; None where ln E is; spread: its standard
+    deviation.
     """
 
     weights: NDArray[np.float64]
     theta: NDArray[np.float64]
     sd: NDArray[np.float64]
-    profile: Profile
+    profile: Profile | None
     spread: float
 
     def coordinate(self, theta: NDArray[np.float64] | float) -> NDArray[np.float64]:
         """The coordinate (n,) of ln E, as long as ln E at the estimate: the spread times r, beyond its ends a line."""
-        places, roots = self.profile.theta, np.maximum.accumulate(self.profile.root)
         there = np.atleast_1d(np.asarray(theta, dtype=np.float64))
-        if len(places) < 2:
+        if self.profile is None or len(self.profile.theta) < 2:
             return np.asarray(there - self.theta[0])
+        places, roots = self.profile.theta, np.maximum.accumulate(self.profile.root)
         found = self.spread * np.interp(there, places, roots)
         for end, side, inner in ((0, there < places[0], 1), (-1, there > places[-1], -2)):
             steps = places[end] - places[inner]
@@ -122,7 +137,10 @@ class Marginal:
         return np.asarray(found)
 
     def at(self, which: NDArray[np.int64], away: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Ln E (n,) at coordinates that lie `away` (n,) from those of explanations `which` (n,); by a table."""
+        """Ln E (n,) that lie `away` (n,) from the estimates of explanations `which` (n,) in the coordinate.
+
+        By a table.
+        """
         places = self.coordinate(self.theta)[which] + away
         reach = float(np.abs(away).max(initial=0.0)) / FLAT
         table = np.linspace(float(self.theta.min()) - reach, float(self.theta.max()) + reach, TABLE)
@@ -143,15 +161,22 @@ class Marginal:
         return float(optimize.brentq(excess, low, high, xtol=1e-6))
 
     def interval(self, bounds: tuple[float, float]) -> Interval:
-        """The equal-tailed 95 % interval of E as a ratio to the scale; an end beyond the bounds is open."""
+        """The equal-tailed 95 % interval of E as a ratio to the scale.
+
+        An end is open beyond the bounds, and beyond the places to which the profile could be followed.
+        """
         low, high = self.quantile(TAIL, bounds), self.quantile(1.0 - TAIL, bounds)
+        if self.profile is not None:
+            first, last = float(self.profile.theta[0]), float(self.profile.theta[-1])
+            low = None if low is None or (self.profile.low is None and low < first) else low
+            high = None if high is None or (self.profile.high is None and high > last) else high
         return (None if low is None else float(np.exp(low)), None if high is None else float(np.exp(high)))
 
 
-def marginals_of(stated: StatedMixture, profiles: tuple[Profile, ...]) -> tuple[Marginal, ...]:
-    """That of each parameter, by the `profiles` of the likeliest explanation."""
+def marginals_of(stated: StatedMixture, intervals: Sequence[ModulusInterval]) -> tuple[Marginal, ...]:
+    """That of each parameter, by the `intervals` of the likeliest explanation: by their profiles where these lean."""
     found = []
-    for i, profile in enumerate(profiles):
-        sd = np.sqrt(stated.covariances[:, i, i])
+    for i, of in enumerate(intervals):
+        sd, profile = np.sqrt(stated.covariances[:, i, i]), of.profile if of.kind == "profile" else None
         found.append(Marginal(stated.weights, stated.theta[:, i], sd, profile, float(sd[0])))
     return tuple(found)

@@ -195,7 +195,10 @@ def frame_blocks(motion: PrescribedMotion, state: int) -> tuple[Block, ...]:
             blocks.append(("smooth", tuple(levels)))
     if motion.n_rigid:
         unit = np.eye(motion.n_rigid)
-        rigid = Alternative(unit * STILL_RIGID**2, 0.0, "still"), Alternative(unit * MOVED_RIGID**2, 0.0, "moves")
+        rigid = (
+            Alternative(unit * STILL_RIGID**2, 0.0, "still as a whole"),
+            Alternative(unit * MOVED_RIGID**2, 0.0, "moves as a whole"),
+        )
         blocks.append(("rigid", rigid))
     return tuple(
         Block("frame", FRAME, Acts.BOUNDARY, (state,), levels, Choice.FRAME, unit_mm=motion.smooth_mm)

@@ -1,0 +1,74 @@
+"""The frozen posterior is the objective near by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.errors import ConfigurationError
+from palpate.inversion import Bounds, fixed_correspondence, frozen_posterior, gauss_newton
+from palpate.mechanics.finite_strain import finite_strain_model
+from palpate.mechanics.first_order import expanded
+from palpate.mechanics.laws.registry import law_named
+from palpate.observation.noise_model import NoiseModel
+
+WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
+NOISE = NoiseModel(np.array([0.05**2]), np.array([3.0]))
+
+
+@pytest.fixture(scope="module", params=["flat", "normal"])
+def objective(request, twins, twin):
+    """With a flat prior of the log-moduli, and with a normal one."""
+    found = twins.objective_of(twins.exact_problem(twin, noise=NOISE), twin.coefficients).rematched(twin.unknowns)
+    if request.param == "flat":
+        return found
+    return replace(found, parameters=found.parameters.with_prior(twins.TRUTH + 0.02, np.full(2, 0.02)))
+
+
+@pytest.fixture(scope="module")
+def minimum(objective, twin):
+    return gauss_newton(objective, twin.unknowns, bounds=WIDE).unknowns
+
+
+def test_the_frozen_posterior_has_the_value_and_score_of_the_objective_where_it_is_frozen(objective, minimum, rng):
+    place = minimum + 0.05 * rng.standard_normal(len(minimum))
+    frozen, evaluation = frozen_posterior(objective, place), objective(place)
+    assert frozen(place).value == pytest.approx(evaluation.value, rel=1e-9)
+    for _ in range(3):
+        step = 1e-4 * rng.standard_normal(len(minimum))
+        slope = 0.5 * (frozen(place + step).value - frozen(place - step).value)
+        assert slope == pytest.approx(float(evaluation.score @ step), rel=1e-4, abs=1e-9)
+
+
+def test_in_the_driver_the_frozen_posterior_is_the_quadratic_of_gauss_newton(objective, minimum, rng):
+    frozen, evaluation = frozen_posterior(objective, minimum), objective(minimum)
+    step = np.concatenate([np.zeros(2), 0.1 * rng.standard_normal(len(minimum) - 2)])
+    expected = evaluation.value + evaluation.score @ step + 0.5 * step @ evaluation.matrix @ step
+    assert frozen(minimum + step).value == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_full_model_is_refused(objective, minimum, twin):
+    states = (replace(objective.states[0], observed=twin.model),)
+    with pytest.raises(ConfigurationError, match="LinearModel"):
+        frozen_posterior(replace(objective, states=states), minimum)
+
+
+def test_an_expansion_that_bends_is_frozen_with_its_own_value_far_away(twins, rng):
+    """As the objective with the same closest points has it, residual by residual."""
+    twin = twins.make_twin(element="P1", seed=8)
+    problem, law = twins.exact_problem(twin, noise=NOISE), law_named("neo-hookean")
+    plain = twins.objective_of(problem, twin.coefficients)
+    moduli, q = twin.moduli, 0.5 * twin.coefficients
+    there = finite_strain_model(twin.model.space, twin.model.constraint, law).solve(moduli, q)
+    first = expanded(there, names=twin.model.names, moduli=moduli, coefficients=q)
+    (state,) = plain.states
+    bent = replace(plain, states=(replace(state, observed=first.outputs(state.seen), bending=state.approximation),))
+    unknowns = np.concatenate([twins.TRUTH, q])
+    bent = bent.rematched(unknowns)
+    evaluation = bent(unknowns)
+    frozen, fixed = frozen_posterior(bent, unknowns, evaluation), fixed_correspondence(bent, unknowns, evaluation)
+    away = unknowns + 0.5 * rng.standard_normal(len(unknowns))
+    assert frozen(away).value == pytest.approx(fixed(away).value, rel=1e-9)
+    assert frozen(unknowns).value == pytest.approx(fixed(unknowns).value, rel=1e-9)
