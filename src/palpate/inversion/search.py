@@ -115,8 +115,9 @@ def searched(
     """The search followed from where it has `begun` until the posterior's mean moves no more by the `rule`.
 
     The noise is fitted anew until a step was no longer than a standard deviation, and once more where that led: fitted
-    further away, it has correlations of what is still motion. Then it stays, and so does the objective. begins (n_unknowns,) each: where further minima are sought. A search that does not end by its
-    rule says so in its minimum's outcome. Raises `EstimationError`s of models that cannot be solved.
+    further away, its correlations are those of what is still motion. Then it stays, and so does the objective. begins
+    (n_unknowns,) each: where further minima are sought. A search that does not end by its rule says so in its minimum's
+    outcome. Raises `EstimationError`s of models that cannot be solved.
     """
     now = begin
     for number in range(1, rule.iterations + 1):
