@@ -334,6 +334,19 @@ def dense_evidence(of: Patient, seen, chosen, *, theta=(0.0, 0.0), theta_sd=1e3)
     return float(-0.5 * (away @ np.linalg.solve(total, away) + np.linalg.slogdet(total)[1]))
 
 
+def exact_posterior(of: Patient, seen):
+    """Mean (2,) and covariance (2, 2) of ln E of a linear body, over all explanations, by whole matrices."""
+    every, design, read = list(every_explanation(of.parameters)), of.design(), np.concatenate(seen)
+    levels = np.array([odds + dense_evidence(of, seen, chosen) for chosen, odds in every])
+    weights = np.exp(levels - levels.max()) / np.sum(np.exp(levels - levels.max()))
+    priors = (of.parameters.choosing(dict(chosen)).prior_matrix for chosen, _ in every)
+    whole = [np.linalg.inv(design.T @ design / SD**2 + prior) for prior in priors]
+    means = np.stack([(inverse @ design.T @ read / SD**2)[:2] for inverse in whole])
+    away = means - weights @ means
+    within = np.tensordot(weights, np.stack([inverse[:2, :2] for inverse in whole]), axes=1)
+    return weights @ means, within + (away.T * weights) @ away
+
+
 def settings(*starts) -> InversionSettings:
     return InversionSettings(tuple(np.asarray(start, dtype=float) for start in starts or ([0.0, 0.0],)), WIDE)
 

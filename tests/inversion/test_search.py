@@ -62,6 +62,41 @@ def test_it_ends_near_the_truth_in_few_iterations(bent, found):
     assert np.all(np.abs(found.minimum.unknowns[:2] - found.mixture.mean) < REPORTED.step_sd * sd_of(found.mixture))
 
 
+@pytest.mark.parametrize("gain", [1.0, 0.08])
+@pytest.mark.parametrize("seed", range(4))
+def test_of_a_linear_body_the_estimate_is_the_exact_posterior(patients, gain, seed):
+    """Over all explanations, those that are left out for being too unlikely included; a frame hardly moves."""
+    rng = np.random.default_rng(seed)
+    of = patients.with_unknowns(patients.patient(rng, gain=(gain, gain)), FRAME, [0.25, -0.3])
+    problem = of.problem(rng)
+    found = invert(problem, patients.settings(), progress=silent).mixture
+    mean, covariance = patients.exact_posterior(of, patients.seen_in(Objective(problem.states, problem.parameters)))
+    sd = np.sqrt(np.diag(covariance))
+    assert np.all(np.abs(found.mean - mean) < REPORTED.step_sd * sd)
+    assert sd_of(found) == pytest.approx(sd, rel=0.02)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_so_it_is_of_several_images_none_of_which_tells_whether_its_frame_has_moved(patients, seed):
+    """Frames move organs nearly as their moduli do: the weight lies on many combinations of the three images."""
+    rng = np.random.default_rng(seed)
+    of = patients.patient(rng, 3)
+    of = patients.without(of, [i for i, block in enumerate(of.parameters.blocks) if block.cause != "frame"])
+    bodies, truth = [], of.truth.copy()
+    for body in of.bodies:
+        slopes = body.slopes.copy()
+        slopes[:, 4:6] = slopes[:, :2] + 0.3 * slopes[:, 4:6]
+        bodies.append(replace(body, slopes=slopes))
+    truth[2:] = 0.06 * rng.standard_normal(len(truth) - 2)
+    of = replace(of, bodies=tuple(bodies), truth=truth)
+    problem = of.problem(rng)
+    found = invert(problem, patients.settings(), progress=silent).mixture
+    mean, covariance = patients.exact_posterior(of, patients.seen_in(Objective(problem.states, problem.parameters)))
+    sd = np.sqrt(np.diag(covariance))
+    assert np.all(np.abs(found.mean - mean) < REPORTED.step_sd * sd)
+    assert sd_of(found) == pytest.approx(sd, rel=0.05)
+
+
 def test_the_noise_is_that_of_the_readings(patients, found):
     sds = [sd for sd, _ in scales(found.objective)]
     assert sds == pytest.approx([sds[0]] * 2)

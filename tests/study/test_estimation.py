@@ -14,7 +14,6 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
 from palpate.study.samples import draw_moduli
-from palpate.study.stated_posterior import stated_posterior
 from palpate.study.verdicts import estimates_of, intervals_of, or_as_ratio, verdict
 from palpate.uncertainty import (
     FittedState,
@@ -400,7 +399,7 @@ def test_what_did_not_converge_is_not_sampled(inversion, settings, observed):
 
 
 def test_an_interval_of_samples_is_open_where_that_of_the_estimate_is(inversion, settings, estimation):
-    posterior = stated_posterior(inversion, estimation.covariance, settings.bounds)
+    posterior = as_stated(inversion, estimation.covariance, settings.bounds)
     marginals = [of.marginal for of in intervals_of(inversion, settings, posterior)]
     ends, given = [(20.0, None), (None, None)], {"draws": 100, "rng": np.random.default_rng(1)}
     found = draw_moduli(inversion.objective.parameters, posterior.mixture, marginals, ends, **given).interval95
@@ -448,7 +447,7 @@ def test_an_interval_that_could_not_be_followed_says_so_and_blames_no_bound(inve
             there = frozen(unknowns)
             return replace(there, score=-100.0 * there.score)
 
-    posterior = stated_posterior(inversion, covariance, settings.bounds)
+    posterior = as_stated(inversion, covariance, settings.bounds)
     assert all(of.followed for of in intervals_of(inversion, settings, posterior))
     away = replace(minimum, unknowns=minimum.unknowns + 0.1)
     known = intervals_of(inversion, settings, replace(posterior, frozen=Uphill(), minimum=away))

@@ -201,6 +201,15 @@ class _Eliminated:
     level: float
 
 
+def _likeliest_together(gains: Sequence[Mapping[int, float]], most: int) -> dict[tuple[int, ...], float]:
+    """Combinations of one number of each image with the sum of their gains, those above -`SEEN`, `most` at most."""
+    found: list[tuple[tuple[int, ...], float]] = [((), 0.0)]
+    for of in gains:
+        longer = [((*numbers, i), level + gain) for numbers, level in found for i, gain in of.items()]
+        found = sorted((each for each in longer if each[1] > -SEEN), key=lambda each: -each[1])[:most]
+    return dict(found)
+
+
 @dataclass(frozen=True, slots=True)
 class LinearEvidence:
     """The log-evidence of explanations on residuals that are linear in all unknowns.
@@ -252,19 +261,20 @@ class LinearEvidence:
             )
 
     def compared(self, most: int) -> list[_Compared]:
-        """The likeliest explanations, `most` at most: of each scenario the likeliest, and all others of one image.
+        """The likeliest explanations, `most` at most: of each scenario the likeliest, and others of its images.
 
-        Of several images the alternatives of each are chosen in turn, beside those of the others.
+        Of several images the alternatives of each are chosen in turn, beside those of the others. Which combinations
+        are likely is then told by what each of an image's alternatives loses alone.
         """
         found, fewest = list[_Compared](), max(most // max(len(self.images), 1), FEWEST)
         for scenario in scenarios_of(self.parameters.blocks):
-            found += self._of_scenario(scenario)
+            found += self._of_scenario(scenario, most)
         best = max(of.evidence for of in found)
         found = sorted((of for of in found if of.evidence > best - SEEN), key=lambda of: -of.evidence)
         return found[:fewest]
 
-    def _of_scenario(self, scenario: Alternatives) -> list[_Compared]:
-        """Its likeliest explanation, and those that differ in one image and are seen beside it."""
+    def _of_scenario(self, scenario: Alternatives, most: int) -> list[_Compared]:
+        """Its likeliest explanation, and those that are seen beside it, `most` at most."""
         parameters, shared = self.parameters.choosing(dict(scenario.chosen)), self.shared
         prior, centre = parameters.prior_matrix[np.ix_(shared, shared)], parameters.prior_centre[shared]
         n = parameters.n_parameters
@@ -296,10 +306,13 @@ class LinearEvidence:
             if numbers == before:
                 break
         by_image = [others(numbers, k) for k in range(len(self.images))] if len(self.images) > 1 else by_image
-        levels = {each: level for of in by_image for each, level in of.items()} or {(): evidence(())}
-        best = levels[numbers]
-        product = sum(float(np.log(np.sum(np.exp(np.array(list(of.values())) - best)))) for of in by_image)
-        several = product - float(np.log(np.sum(np.exp(np.array(list(levels.values())) - best))))
+        best = max(level for of in by_image for level in of.values()) if by_image else evidence(())
+        gains = [{each[k]: level - best for each, level in of.items()} for k, of in enumerate(by_image)]
+        together = _likeliest_together(gains, most)
+        every = [float(np.log(np.sum(np.exp(list(of.values()))))) for of in gains]
+        several = sum(every) - float(np.log(np.sum(np.exp(list(together.values())))))
+        levels = {each: evidence(each) for each in together}
+        best = max(levels.values())
         seen = [(each, level) for each, level in levels.items() if level > best - SEEN]
         return [self._compared(scenario, each, level + several, several, prior, pull) for each, level in seen]
 

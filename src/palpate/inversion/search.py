@@ -28,7 +28,7 @@ FITS = 3  # of noise and amplitudes in an iteration, with the residuals linear
 NEAR = 1e-3  # decrement of a minimum on linear residuals
 HALVINGS = 5  # of a step that leads to a state which cannot be solved, or to a worse fit
 WORSE = 2.0  # rise of J at which a step is halved: closest points that slide over voxels make less
-FLOOR = 3e-4  # of ln E: a move that is always short enough
+FLOOR = 1e-4  # of ln E: a move that is always short enough
 MEMORY, DEPENDENT = 2, 1e-2  # earlier iterations that count; relative size of ways that count as dependent
 FEW = 8  # explanations that are compared while the search is far from its end
 

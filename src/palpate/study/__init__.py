@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from palpate.study.run import inversion_settings as inversion_settings
     from palpate.study.simulate import filled as filled
     from palpate.study.stated_posterior import StatedPosterior as StatedPosterior
-    from palpate.study.stated_posterior import stated_posterior as stated_posterior
+    from palpate.study.stated_posterior import as_stated as as_stated
     from palpate.study.verdicts import estimates_of as estimates_of
     from palpate.study.verdicts import intervals_of as intervals_of
     from palpate.study.verdicts import verdict as verdict

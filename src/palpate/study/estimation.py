@@ -26,7 +26,7 @@ from palpate.study.map_words import map_findings
 from palpate.study.misfit import beside_misfits, misfits_of
 from palpate.study.poisson_ratios import NOT_IDENTIFIED
 from palpate.study.samples import draw_moduli
-from palpate.study.stated_posterior import stated_posterior
+from palpate.study.stated_posterior import as_stated
 from palpate.study.together import combinations_of, image_pairs_of, regions_of
 from palpate.study.verdicts import IDENTIFIED, estimates_of, intervals_of, ratios_of
 from palpate.uncertainty import (
@@ -71,7 +71,7 @@ def conclude(
     errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
     own = covariance_of(objective, minimum.evaluation, errors)
     progress("intervals: the models made exact where profiles end")
-    posterior = stated_posterior(inversion, own, settings.bounds)
+    posterior = as_stated(inversion, own, settings.bounds)
     covariance = posterior.mixture.covariance
     progress("intervals: profiles, and the fit of every surface before and after")
     pairs = image_pairs_of(inversion, settings.bounds, errors)

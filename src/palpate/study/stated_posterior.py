@@ -32,7 +32,7 @@ class StatedPosterior:
         return np.asarray(self.mixture.covariances[0])
 
 
-def stated_posterior(inversion: Inversion, own: Covariance, bounds: Bounds) -> StatedPosterior:
+def as_stated(inversion: Inversion, own: Covariance, bounds: Bounds) -> StatedPosterior:
     """What is stated; own: the covariance of the likeliest explanation by all causes (see `covariance_of`)."""
     objective, minimum = inversion.objective, inversion.minimum
     mixture = stated_mixture(inversion.mixture, own, objective.parameters.blocks)
