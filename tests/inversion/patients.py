@@ -82,8 +82,11 @@ class Expanded:
     counts: SolveCounts = field(default_factory=SolveCounts)
     trust_radius: float = np.inf
 
-    def update(self, at, others=()):
-        del others
+    @classmethod
+    def update_all(cls, each, points):
+        return [one.update(at) for one, at in zip(each, points, strict=True)]
+
+    def update(self, at):
         there = self.body.solve(at.moduli, at.coefficients)
         own = {"names": self.model.names, "moduli": at.moduli, "coefficients": at.coefficients}
         return replace(self, model=expanded(there, **own), counts=self.counts + SolveCounts(forward=1))
@@ -104,8 +107,11 @@ class Whole:
     counts: SolveCounts = field(default_factory=SolveCounts)
     trust_radius: float = np.inf
 
-    def update(self, _at, others=()):
-        del others
+    @classmethod
+    def update_all(cls, each, points):
+        return [one.update(at) for one, at in zip(each, points, strict=True)]
+
+    def update(self, _at):
         return self
 
 

@@ -240,11 +240,11 @@ def folded(patients, bent, times):
     failures = list[int]()
 
     class Folded(patients.Expanded):
-        def update(self, at, others=()):
+        def update(self, at):
             if len(failures) < times:
                 failures.append(1)
                 raise NotConverged("folded")
-            return super().update(at, others)
+            return super().update(at)
 
     start = begin(bent[1])
     (whole,) = start.objective.approximations

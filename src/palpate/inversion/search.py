@@ -163,13 +163,14 @@ def _fixed_point(
     Anderson's acceleration (Walker & Ni, SIAM J. Numer. Anal. 49 (2011) 1715) in standard deviations (n_parameters,):
     without it a search goes to and fro where the responses to patchy tissues depend much on the moduli.
     """
-    places, means = (np.stack(each) / sd for each in zip(*led, strict=True))
+    scale = np.where(np.isfinite(sd), sd, 1.0)  # a modulus that moves nothing has none
+    places, means = (np.stack(each) / scale for each in zip(*led, strict=True))
     ways = means - places
     if len(led) == 1:
-        return np.asarray(means[-1] * sd)
+        return np.asarray(means[-1] * scale)
     by_places, by_ways = np.diff(places, axis=0).T, np.diff(ways, axis=0).T
     shares = np.linalg.lstsq(by_ways, ways[-1], rcond=DEPENDENT)[0]
-    return np.asarray((means[-1] - (by_places + by_ways) @ shares) * sd)
+    return np.asarray((means[-1] - (by_places + by_ways) @ shares) * scale)
 
 
 def _fitted(now: Searched, near: Bounds) -> tuple[Objective, Evaluation]:
