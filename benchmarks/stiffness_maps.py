@@ -1,7 +1,7 @@
 """Whether a map of stiffness finds a stiff ball that the labels do not show, and finds none where there is none.
 
     python benchmarks/stiffness_maps.py [--bodies N] [--draws N] [--first-seed S] [--field-sd-mm 0.2] [--edge MM]
-                                        [--surface-sd-mm 0] [--contrast 3] [--prior total-variation] [--output FILE]
+                                        [--surface-sd-mm 0] [--contrast 3] [--output FILE]
                                         [--json]
 
 Simulated data. A random pelvis whose prostate, of `--gland-kpa` (0: as drawn, 15 to 60) in surroundings of 10 kPa,
@@ -9,8 +9,7 @@ holds a ball of 7 mm radius that is `--contrast` times as stiff, or none (1), is
 `--filling-mm` (0: as drawn, 6 to 8), on a finer mesh; both states are imaged on 1 mm voxels, and a displacement field
 is measured on a lattice of 4 mm in and round the prostate, its errors `--field-sd-mm` a component, alike over 5 mm.
 The surfaces in both images are drawn as they are, or with smooth errors of `--surface-sd-mm`, alike over 6 mm.
-The prostate's modulus is estimated as a field by the program's defaults (linear law; `--prior` total-variation: one
-that may have edges). A line of JSON a draw: whether a
+The prostate's modulus is estimated as a field by the program's defaults (linear law). A line of JSON a draw: whether a
 region was found, with which probability, how far its centre lies from the ball's, its contrast with its interval, how
 much of the prior's variance the data removed, and the share of elements whose ln E lies inside its 95 % interval;
 `in_ball` has the means of ln E over the tissue's and of its standard deviation in the ball, and of the former outside.
@@ -69,7 +68,7 @@ ORGAN = "prostate"
 RADIUS_MM, DEPTH_MM = 7.0, 2.0  # of the ball, and of the tissue around it
 LATTICE_MM, ROUND_MM, ALIKE_MM = 4.0, 15.0, 5.0
 SURFACE_ALIKE_MM, ANOTHER = 6.0, 1000  # length of the surfaces' errors; between the seeds of two draws of them
-PRIORS = {"gaussian": FieldPrior(0.7, 8.0), "total-variation": FieldPrior(0.7, 8.0, total_variation=True)}
+PRIOR = FieldPrior(0.7, 8.0)
 
 
 def main() -> int:
@@ -83,7 +82,6 @@ def main() -> int:
     parser.add_argument("--gland-kpa", type=float, default=15.0)
     parser.add_argument("--filling-mm", type=float, default=14.0)
     parser.add_argument("--contrast", type=float, default=3.0)
-    parser.add_argument("--prior", choices=tuple(PRIORS), nargs="+", default=["gaussian"])
     parser.add_argument("--edge", type=float, default=7.0, help="edge length (mm) of the estimate's mesh")
     parser.add_argument("--output", type=Path)
     parser.add_argument("--json", action="store_true", help="print one JSON document")
@@ -92,11 +90,11 @@ def main() -> int:
     for seed in range(asked.first_seed, asked.first_seed + asked.bodies):
         options = _options(seed, asked.gland_kpa, asked.filling_mm)
         truth = _truth(options, asked.contrast, asked.edge)
-        for sd, prior, draw in product(asked.field_sd_mm, asked.prior, range(asked.draws)):
+        for sd, draw in product(asked.field_sd_mm, range(asked.draws)):
             row = {"seed": seed, "draw": draw, "contrast": asked.contrast, "field_sd_mm": sd}
-            row |= {"surface_sd_mm": asked.surface_sd_mm, "prior": prior}
+            row |= {"surface_sd_mm": asked.surface_sd_mm}
             drawn = _drawn(truth, asked.surface_sd_mm, draw)
-            found.append(row | _estimated(drawn, sd, asked.edge, draw, PRIORS[prior]))
+            found.append(row | _estimated(drawn, sd, asked.edge, draw))
             if asked.output:
                 with asked.output.open("a") as file:
                     file.write(json.dumps(found[-1]) + "\n")
@@ -155,11 +153,11 @@ def _drawn(truth: _Truth, surface_sd_mm: float, draw: int) -> _Truth:
     return replace(truth, scene=replace(scene, before=images.before, after=images.after))
 
 
-def _estimated(truth: _Truth, sd_mm: float, edge_mm: float, draw: int, prior: FieldPrior) -> dict[str, Any]:
+def _estimated(truth: _Truth, sd_mm: float, edge_mm: float, draw: int) -> dict[str, Any]:
     """What the map says of one draw of the field's errors."""
     began, scene, log_ratio, centre = time.perf_counter(), truth.scene, truth.log_ratio, truth.centre
     case = Case("map", phantom=Phantom("pelvis"), mesh=MeshSettings(edge_mm), mechanics=Mechanics("linear", "auto"))
-    tissues = tuple(replace(t, field=prior) if t.name == ORGAN else t for t in scene.tissues)
+    tissues = tuple(replace(t, field=PRIOR) if t.name == ORGAN else t for t in scene.tissues)
     before, after = (segment(image, tissues) for image in (scene.before, scene.after))
     body = make_body(aligned(before, (after,), method="none"), case, progress=_silent)
     problem = inverse_problem(body, case, progress=_silent)
