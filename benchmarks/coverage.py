@@ -280,12 +280,14 @@ def _limits(inversion: Inversion, row: Row) -> dict[str, list[float]]:
         "limit_layers": (*held, Choice.LAYERS),
         "limit_widest": (*held, Choice.PATCHINESS, Choice.FRAME, Choice.DRAWING),
     }
-    for name in wide:
+    for name, choices in wide.items():
         prior = evaluation.prior.copy()
         for i, block in enumerate(parameters.blocks):
             own = np.ix_(parameters.columns(i), parameters.columns(i))
-            if block.choice in wide[name]:
+            if block.choice in choices:
                 prior[own] = np.linalg.inv(block.widest)
+            elif block.choice is Choice.LAYERS:
+                prior[own] = np.linalg.inv(block.alternatives[0].covariance)
         variances = np.diag(np.linalg.inv(known + prior))
         found[name] = np.sqrt(variances[: parameters.n_parameters]).tolist()
     return found
