@@ -31,9 +31,10 @@ from palpate.inversion import (
     Inversion,
     InversionSettings,
     Objective,
-    concluded,
-    continued,
+    Searched,
+    at_finite_strain,
     invert,
+    searched,
 )
 from palpate.mesh import LagrangeSpace, triangle_normals
 from palpate.observation import NoiseModel, fit_noise_model, observed_surface
@@ -130,18 +131,14 @@ def _silent(message: str) -> None:
 
 def _from_far_off(finite: Inversion, linear: Inversion, settings: InversionSettings) -> Inversion:
     """The continuation of a `finite` estimate from moduli three times too high and too low, not the linear one's."""
-    n, best = linear.objective.n_parameters, linear.candidates[linear.best]
-    unknowns = linear.minimum.unknowns.copy()
+    n, unknowns = linear.objective.n_parameters, linear.minimum.unknowns.copy()
     unknowns[:n] += FAR_OFF[:n]
     pairs = zip(linear.objective.states, finite.objective.states, strict=True)
     states = tuple(replace(state, finite_strain=given.finite_strain) for state, given in pairs)
-    iterate = replace(
-        best.iterate,
-        objective=replace(linear.objective, states=states),
-        minimum=replace(linear.minimum, unknowns=unknowns),
-    )
-    ends = continued((iterate,), settings.bounds, rule=REPORTED, progress=_silent)
-    return concluded(ends, (), linear.rest, settings.bounds)
+    near = Searched(replace(linear.objective, states=states), replace(linear.minimum, unknowns=unknowns))
+    near = at_finite_strain(near, progress=_silent)
+    end = searched(near, settings.bounds, REPORTED, progress=_silent, title="far off")
+    return Inversion(end.objective, end.minimum, end.posterior, (), linear.rest, end.minimum.evaluations, end.counts)
 
 
 def _errors(inversion: Inversion, scene: Scene) -> Result:
@@ -212,10 +209,8 @@ def at_truth(inversion: Inversion, problem: InverseProblem, scene: Scene) -> Inv
     objective = Objective(problem.states, mapping).under([exact])
     objective = objective.with_observations([o.with_noise(noise[o.kind]) for o in objective.observations])
     objective = objective.rematched(unknowns)
-    best = inversion.candidates[inversion.best]
-    minimum = replace(best.minimum, unknowns=unknowns, evaluation=objective(unknowns))
-    iterate = replace(best.iterate, objective=objective, minimum=minimum)
-    return replace(inversion, candidates=(replace(best, iterate=iterate),), best=0)
+    minimum = replace(inversion.minimum, unknowns=unknowns, evaluation=objective(unknowns))
+    return replace(inversion, objective=objective, minimum=minimum)
 
 
 def true_noise(

@@ -43,14 +43,15 @@ from palpate.study import (
     MeshSettings,
     Phantom,
     aligned,
+    as_stated,
     estimates_of,
     intervals_of,
     inverse_problem,
     inversion_settings,
     make_body,
-    stated_posteriors,
 )
 from palpate.uncertainty import covariance_of, gain, noise_covariance
+from palpate.unknowns import Choice
 from palpate_validation.truth import target_of_truth
 
 Array = NDArray[np.float64]
@@ -221,28 +222,27 @@ def _moduli(inversion: Inversion, body: Body, row: Row) -> list[Result]:
     """By tissue: the error of ln E, its standard deviation, the ends of its intervals less the truth, the verdict."""
     objective, minimum = inversion.objective, inversion.minimum
     errors = [[np.zeros(len(line.weights)) for line in minimum.evaluation.linearisations]] * NO_GRID
-    bonded = covariance_of(objective, minimum.evaluation, errors, unknowns=minimum.unknowns)
-    covariance, posteriors = stated_posteriors(inversion, bonded, body.settings.bounds)
-    known = intervals_of(inversion, body.settings, posteriors)
-    without = intervals_of(inversion, body.settings, posteriors[:1])
+    bonded = covariance_of(objective, minimum.evaluation, errors)
+    posterior = as_stated(inversion, bonded, body.settings.bounds)
+    covariance, known = posterior.mixture.covariance, intervals_of(inversion, body.settings, posterior)
     estimates = estimates_of(inversion, known, covariance, truth={})
     limits = _limits(inversion, row)
     of_noise = None if row.limit is None else _by_true_noise(inversion, row.limit)
     scale, found = objective.parameters.scale_kpa, []
-    for i, (estimate, of, of_bonded) in enumerate(zip(estimates, known, without, strict=True)):
+    for i, (estimate, of) in enumerate(zip(estimates, known, strict=True)):
         given = estimate.interval95_given_model
         found.append(
             {
                 "tissue": estimate.tissue,
-                "error": float(minimum.unknowns[i] - body.truth[i]),
-                "sd": float(np.sqrt(bonded.total[i, i])),
+                "error": float(of.theta - body.truth[i]),
+                "sd": float(np.sqrt(covariance.total[i, i])),
                 "sd_true_noise": None
                 if of_noise is None
-                else float(np.sqrt(bonded.total[i, i] - bonded.noise[i, i] + of_noise[i, i])),
+                else float(np.sqrt(covariance.total[i, i] - covariance.noise[i, i] + of_noise[i, i])),
                 "shares": {name: round(share, 4) for name, share in covariance.shares(i).items()},
                 "verdict": estimate.verdict,
                 "interval": _ends(of.interval, body.truth[i]),
-                "own": _ends(of_bonded.own.ends, body.truth[i]),
+                "own": _ends(of.own.ends, body.truth[i]),
                 "given_model": _ends(given, body.truth[i] + np.log(scale)) if given else None,
                 **{name: limit[i] for name, limit in limits.items()},
             }
@@ -274,14 +274,20 @@ def _limits(inversion: Inversion, row: Row) -> dict[str, list[float]]:
         return {}
     evaluation, parameters = inversion.minimum.evaluation, inversion.objective.parameters
     known, found = fisher_information(evaluation, row.limit, cell_mm=float(row.limit.lengths[0])), {}
-    for name in ("limit", "limit_layers", "limit_widest"):
+    held = (Choice.HELD,)  # is unknown to a limit as well
+    wide = {
+        "limit": held,
+        "limit_layers": (*held, Choice.LAYERS),
+        "limit_widest": (*held, Choice.PATCHINESS, Choice.FRAME, Choice.DRAWING),
+    }
+    for name, choices in wide.items():
         prior = evaluation.prior.copy()
         for i, block in enumerate(parameters.blocks):
             own = np.ix_(parameters.columns(i), parameters.columns(i))
-            if block.considered or (block.released and name == "limit_layers"):  # is unknown to a limit as well
-                prior[own] = block.precision
-            elif block.odds and name == "limit_widest":
-                prior[own] = np.linalg.inv(max((terms[0] for terms in block.alternatives), key=np.trace))
+            if block.choice in choices:
+                prior[own] = np.linalg.inv(block.widest)
+            elif block.choice is Choice.LAYERS:
+                prior[own] = np.linalg.inv(block.alternatives[0].covariance)
         variances = np.diag(np.linalg.inv(known + prior))
         found[name] = np.sqrt(variances[: parameters.n_parameters]).tolist()
     return found

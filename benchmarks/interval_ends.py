@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from palpate.approximation import ReducedBasis
 from palpate.inversion import Bounds, Objective, frozen_posterior, invert
-from palpate.study import StatedPosterior, stated_posteriors
+from palpate.study import StatedPosterior
 from palpate.uncertainty import Profile, covariance_of, modulus_interval
 
 NO_GRID = 3  # draws of a voxel grid, in which nothing is off
@@ -51,14 +51,11 @@ def measured(seed: int, edge_mm: float, law: str) -> dict[str, Any]:
     """By how much of ln E the ends of one body's profiles are off on either basis, lower and upper of each modulus."""
     case = posed(replace(ROWS["clean"], held=False, edge_mm=edge_mm, law=law), seed, 0, {})
     bounds, inversion = case.settings.bounds, invert(case.problem, case.settings, progress=lambda _: None)
-    evaluation, unknowns = inversion.minimum.evaluation, inversion.minimum.unknowns
+    objective, evaluation = inversion.objective, inversion.minimum.evaluation
     errors = [[np.zeros(len(term.weights)) for term in evaluation.linearisations]] * NO_GRID
-    bonded = covariance_of(inversion.objective, evaluation, errors, unknowns=unknowns)
-    stated = stated_posteriors(inversion, bonded, bounds)[1][-1]
-    last = inversion.released or inversion.candidates[inversion.best].iterate
-    left = replace(stated, frozen=frozen_posterior(last.objective, stated.minimum.unknowns))
-    n = last.objective.n_parameters
-    objective = last.objective
+    stated = as_stated(inversion, covariance_of(objective, evaluation, errors), bounds)
+    n = objective.n_parameters
+    left = replace(stated, frozen=frozen_posterior(objective, stated.minimum.unknowns))
     for profile in profiles(stated, n, bounds):
         for place in profile.outermost:
             objective = with_all_responses(objective, place)

@@ -1,4 +1,4 @@
-"""Speed: an estimate in forward solves, gradients beside those of other programs, the posterior, the cost by mesh size.
+"""Speed: an estimate in forward solves, gradients beside those of other programs, the cost by mesh size.
 
     python benchmarks/speed.py [--parts solver,linear,nonlinear,gradient,...] [--quick] [--json]
 
@@ -39,9 +39,7 @@ from palpate.inversion import (
     Inversion,
     InversionSettings,
     Objective,
-    frozen_posterior,
     invert,
-    posterior_sd,
 )
 from palpate.mechanics import expected_of_size, linear_model, outer_constraint, weighted_sum
 from palpate.mesh import lagrange_space, tetrahedralise
@@ -60,19 +58,17 @@ from palpate.study import (
     inversion_settings,
     make_body,
 )
-from palpate.uncertainty import posterior_chains, sandwich_covariance
+from palpate.uncertainty import sandwich_covariance
 
-PARTS = "solver,linear,nonlinear,gradient,posterior,scaling,front_end,default,signals,field,map"
+PARTS = "solver,linear,nonlinear,gradient,scaling,front_end,default,signals,field,map"
 IN_A_ROW = 20  # gradients, as an optimiser asks for them
 STARTS = (0.5, 1.0, 2.0, 4.0, 8.0)  # moduli to the surroundings'
 SCALING_EDGES = (9.0, 6.0, 4.0, 2.7, 1.85, 1.65)  # mm: 30 k to 1 M unknowns
 
-EVALUATIONS_A_DRAW = 11  # ten, and those of the draws that are left out
-
 
 @dataclass(frozen=True)
 class Sizes:
-    """Edge lengths (mm) at the organs, repetitions, evaluations."""
+    """Edge lengths (mm) at the organs, repetitions."""
 
     solver: float = 4.5  # 122 k unknowns, 111 k of them free
     linear: float = 4.5  # 130 k unknowns
@@ -80,7 +76,6 @@ class Sizes:
     gradient: float = 8.5  # 28 k unknowns
     scaling: tuple[float, ...] = SCALING_EDGES
     repeats: int = 3
-    evaluations: int = 100_000
     starts_of_peers: int = 1
     map: tuple[float, int] = (8.0, 200)  # and modes: 10 k unknowns
 
@@ -314,31 +309,6 @@ def _gradient(sizes: Sizes, seed: int, say: Say) -> Result:
     }
 
 
-def _posterior(sizes: Sizes, seed: int, say: Say) -> Result:
-    posed = problem_of(sizes.linear, seed)
-    inversion = _estimate(posed.problem, posed.settings)
-    n = inversion.objective.n_parameters
-    say("sampling")
-    minimum, began = inversion.minimum, time.perf_counter()
-    found = posterior_chains(
-        frozen_posterior(inversion.objective, minimum.unknowns, minimum.evaluation),
-        minimum.unknowns,
-        minimum.evaluation,
-        minimum.evaluation.covariance_columns(n)[:n],
-        bounds=posed.settings.bounds,
-        chains=1,
-        draws=sizes.evaluations // EVALUATIONS_A_DRAW,
-        rng=np.random.default_rng(seed),
-    )
-    seconds = time.perf_counter() - began
-    return {
-        "posterior_100k_s": seconds * 100_000 / sizes.evaluations,
-        "posterior_accepted": float(found.accepted[0]),
-        "posterior_sd": found.theta[0].std(axis=0).tolist(),
-        "gauss_newton_sd": posterior_sd(inversion.minimum, n).tolist(),
-    }
-
-
 def _scaling(sizes: Sizes, seed: int, say: Say) -> Result:
     """Each size in a process of its own, so that its peak memory is its own."""
     rows = []
@@ -425,7 +395,6 @@ PART = {
     "linear": _linear,
     "nonlinear": _nonlinear,
     "gradient": _gradient,
-    "posterior": _posterior,
     "scaling": _scaling,
     "front_end": _front_end,
     "default": _default,

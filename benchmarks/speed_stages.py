@@ -22,7 +22,7 @@ STAGES = {  # functions whose time, with all that they call, is a stage of its o
     "wall modes": ("prescribed_motion.py", "prescribed_motion"),
     "stiffness assembled": ("linear_model.py", "linear_model"),
     "finite-strain model": ("finite_strain.py", "finite_strain_model"),
-    "minima near which all starts lead": ("starts.py", "from_starts"),
+    "minima near which all starts lead": ("starts.py", "started"),
     "their ends": ("continuation.py", "continued"),
     "intervals and fits": ("estimation.py", "conclude"),
     "what would change the answer": ("variations.py", "what_would_change"),

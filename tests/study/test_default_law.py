@@ -46,8 +46,8 @@ def case(request, tmp_path_factory):
     return folder / "case.toml"
 
 
-def test_the_default_law_finds_the_moduli_of_a_body_at_finite_strain(case, request):
-    result = estimate(read_case(case, ["estimate.samples=1000"]))
+def test_the_default_law_finds_the_moduli_of_a_body_at_finite_strain(case):
+    result = estimate(read_case(case, ["estimate.samples=4000"]))
     assert (result.case.mechanics.law, result.case.mechanics.element) == ("neo-hookean", "auto")
     assert result.estimation.status == "converged"
     for found in result.estimation.estimates:
@@ -56,18 +56,12 @@ def test_the_default_law_finds_the_moduli_of_a_body_at_finite_strain(case, reque
         assert found.value == pytest.approx(truth, rel=0.15)
     assert "linear-strains" not in {remark.code for remark in result.remarks}
     samples = result.estimation.samples
-    chains = np.log(samples.moduli)  # on the expansion with the linear law's curvature
+    drawn = np.log(samples.moduli)  # on the expansion with the linear law's curvature
     sd = np.sqrt(np.diag(result.estimation.covariance.total))
-    ends = np.log([found.interval95 for found in result.estimation.estimates])  # which hold layers held and free
-    assert chains.std(axis=(0, 1)) == pytest.approx(sd, rel=0.35)
-    warned = "samples-not-mixed" in {remark.code for remark in result.all_remarks}
-    assert warned == (not samples.diagnostics.mixed.all())
-    if request.node.callspec.params["case"] == VALLEY:
-        assert warned
-        return
-    assert samples.diagnostics.ess_tail.min() > 100
-    assert np.all(np.quantile(chains, 0.025, axis=(0, 1)) > ends[:, 0] - 0.2 * sd)
-    assert np.all(np.quantile(chains, 0.975, axis=(0, 1)) < ends[:, 1] + 0.2 * sd)
+    ends = np.log([found.interval95 for found in result.estimation.estimates])
+    assert drawn.std(axis=0) == pytest.approx(sd, rel=0.35)
+    assert np.quantile(drawn, 0.025, axis=0) == pytest.approx(ends[:, 0], abs=0.2 * sd.max())
+    assert np.quantile(drawn, 0.975, axis=0) == pytest.approx(ends[:, 1], abs=0.2 * sd.max())
 
 
 @pytest.mark.parametrize("case", [1], indirect=True)

@@ -60,7 +60,9 @@ def widths(prediction):
 
 
 def noisy(sd_mm):
-    return {"noise": Noise(surface_sd_mm=sd_mm, correlation_length_mm=6.0), "discrepancy": Discrepancy(0.0, 25.0, 0.0)}
+    """Where noise is most of what is unknown."""
+    without = Discrepancy(0.0, 25.0, 0.0, layer_sd=0.05)
+    return {"noise": Noise(surface_sd_mm=sd_mm, correlation_length_mm=6.0), "discrepancy": without}
 
 
 def test_a_modulus_is_guessed_as_its_tissue_states_it(prediction_of):

@@ -9,12 +9,12 @@ import jsonschema
 import numpy as np
 import pytest
 import referencing
-from palpate.inversion.trust_region import REPORTED
 
 import palpate
 from palpate.cli import main
 from palpate.errors import EstimationError
 from palpate.images.readers import write_label_image
+from palpate.inversion import REPORTED
 from palpate.mechanics.dilatation import choose_element
 from palpate.progress import silent
 from palpate.report.tornado import effect_text, sensitivity_page, sensitivity_table, tornado_rows
@@ -27,6 +27,7 @@ from palpate.study.json_schema import SCHEMAS
 from palpate.study.read import read_states
 from palpate.study.run import inversion_settings
 from palpate.study.variations import fast_variations
+from palpate.unknowns import Choice
 
 CASE = """
 [images]
@@ -209,7 +210,7 @@ def test_a_surface_whose_drawing_is_an_unknown_is_not_moved_beside_it(case_file)
     settings = inversion_settings(case, problem.parameters)
     inversion = inverted((body,), problem, case, settings, progress=silent)
     tissues, linear = body.space.mesh.tissues, choose_element("P1").dilatation
-    sought = {block.of for block in problem.parameters.blocks if block.cause == "offset" and not block.considered}
+    sought = {block.of for block in problem.parameters.blocks if block.choice is Choice.DRAWING}
     assert sought
     rows = fast_variations(inversion, settings, tissues, dilatation=linear, voxel_mm=1.0)
     drawn = [row for row in rows if row.cause == "segmentation" and row.subject in sought]

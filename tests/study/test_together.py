@@ -2,39 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 import pytest
-from scipy.spatial import Delaunay
 
 from palpate.inversion import fixed_correspondence, invert
-from palpate.inversion.objective import Evaluation
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimate_findings import pair_findings
 from palpate.study.stated_posterior import StatedPosterior
 from palpate.study.together import ImagePairs, PairAlone, combinations_of, image_pairs_of, regions_of
-from palpate.uncertainty import sandwich_covariance
+from palpate.uncertainty import Covariance, StatedMixture, sandwich_covariance
 
 NOISE = NoiseModel(np.array([0.1**2]), np.array([3.0]))
-
-
-@dataclass(frozen=True)
-class Bowl:
-    """1/2 (x - c)^T H (x - c) of unknowns (n,), the first two of which have the precision (2, 2); the others 1."""
-
-    centre: np.ndarray
-    precision: np.ndarray
-    n: int
-
-    n_parameters = 2
-
-    def __call__(self, unknowns):
-        matrix = np.eye(self.n)
-        matrix[:2, :2] = self.precision
-        slope = matrix @ (unknowns - self.centre)
-        value = 0.5 * float(slope @ (unknowns - self.centre))
-        return Evaluation(value, value, slope, matrix, (), 0.0 * matrix, 0.0 * slope)
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +30,14 @@ def both(twins, settings):
 @pytest.fixture(scope="module")
 def single(twins, twin, settings):
     return invert(twins.exact_problem(twin, noise=NOISE), settings, progress=twins.silent)
+
+
+def posterior_of(inversion, covariance):
+    """One explanation, that of the minimum, with a covariance (2, 2) of the log-moduli."""
+    minimum, zero = inversion.minimum, np.zeros((2, 2))
+    fixed = fixed_correspondence(inversion.objective, minimum.unknowns, minimum.evaluation)
+    alone = np.ones(1), minimum.unknowns[None, :2], covariance[None]
+    return StatedPosterior(fixed, minimum, StatedMixture(*alone, Covariance(covariance, zero, zero, zero)))
 
 
 def no_errors(inversion):
@@ -80,10 +66,8 @@ def test_one_later_image_has_no_other_to_agree_with(single, settings):
 
 def test_a_mean_is_in_kpa_and_a_ratio_has_no_unit(single, settings):
     wide = np.array([[1.0, -0.995], [-0.995, 1.0]])
-    minimum = single.minimum
-    fixed = fixed_correspondence(single.objective, minimum.unknowns, minimum.evaluation)
-    (mean,) = combinations_of(single, fixed, wide, settings.bounds, within=2.0)
-    (ratio,) = combinations_of(single, fixed, np.abs(wide), settings.bounds, within=2.0)
+    (mean,) = combinations_of(single, posterior_of(single, wide), settings.bounds, within=2.0)
+    (ratio,) = combinations_of(single, posterior_of(single, np.abs(wide)), settings.bounds, within=2.0)
     assert (mean.kind, mean.value) == ("geometric mean", pytest.approx(np.sqrt(30.0 * 20.0), rel=0.05))
     assert (ratio.kind, ratio.value) == ("ratio", pytest.approx(1.5, rel=0.1))
 
@@ -111,11 +95,10 @@ def test_an_image_whose_surfaces_fit_far_worse_is_named(noises, named):
 
 def test_a_region_is_stated_in_kpa_around_the_estimate_of_both(single, settings):
     objective, minimum = single.objective, single.minimum
-    fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
     covariance = sandwich_covariance(objective, minimum.evaluation)
-    posterior = StatedPosterior(fixed, minimum, covariance)
-    assert regions_of(single, [posterior], settings.bounds, tissues={"gland"}) == ()
-    (region,) = regions_of(single, [posterior], settings.bounds, tissues={"gland", "sac"})
+    posterior = posterior_of(single, covariance)
+    assert regions_of(single, posterior, settings.bounds, tissues={"gland"}) == ()
+    (region,) = regions_of(single, posterior, settings.bounds, tissues={"gland", "sac"})
     assert region.tissues == objective.parameters.tissues
     assert not region.open
     estimate = objective.parameters.scale_kpa * np.exp(minimum.unknowns[:2])
@@ -124,29 +107,3 @@ def test_a_region_is_stated_in_kpa_around_the_estimate_of_both(single, settings)
         low, high = np.min(edge, axis=0), np.max(edge, axis=0)
         assert np.all((low < estimate) & (estimate < high))
         assert high / estimate == pytest.approx(half, rel=0.15)
-
-
-def test_a_region_holds_those_of_all_posteriors_that_are_stated(single, settings):
-    """One of them twice as wide, and further: it reaches as far as either, and the estimate of the first lies in it."""
-    objective, minimum = single.objective, single.minimum
-    own = sandwich_covariance(objective, minimum.evaluation)
-    away = minimum.unknowns + np.pad(3.0 * np.sqrt(np.diag(own)) * [1.0, -1.0], (0, len(minimum.unknowns) - 2))
-
-    def posterior(unknowns, covariance):
-        """About other unknowns: the quadratic form of the estimate."""
-        from_there = Bowl(unknowns, np.linalg.inv(covariance), len(unknowns))
-        return StatedPosterior(
-            from_there, replace(minimum, unknowns=unknowns, evaluation=from_there(unknowns)), covariance
-        )
-
-    first, second = posterior(minimum.unknowns, own), posterior(away, 4.0 * own)
-    alone, other, both = (
-        np.log(regions_of(single, of, settings.bounds, tissues={"gland", "sac"})[0].boundary)
-        for of in ([first], [second], [first, second])
-    )
-    for i in range(2):
-        ends = [of[:, i].min() for of in (alone, other)], [of[:, i].max() for of in (alone, other)]
-        assert both[:, i].min() == pytest.approx(min(ends[0]), abs=1e-9)
-        assert both[:, i].max() == pytest.approx(max(ends[1]), abs=1e-9)
-    hull = Delaunay(both)
-    assert np.all(hull.find_simplex(0.999 * np.concatenate([alone, other]) + 0.001 * both.mean(axis=0)) >= 0)

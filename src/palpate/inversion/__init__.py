@@ -2,6 +2,7 @@
 
 from palpate.inversion.estimate import Inversion as Inversion
 from palpate.inversion.estimate import InversionSettings as InversionSettings
+from palpate.inversion.estimate import at_finite_strain as at_finite_strain
 from palpate.inversion.estimate import first_noise_of as first_noise_of
 from palpate.inversion.estimate import invert as invert
 from palpate.inversion.frozen_posterior import FixedCorrespondence as FixedCorrespondence

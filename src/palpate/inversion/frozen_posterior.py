@@ -249,7 +249,10 @@ class Posterior(LeastSquares, Protocol):
 
 
 def cheapest_posterior(objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation) -> Posterior:
-    """The objective with the closest points and weights of an evaluation: frozen, where its models are reduced ones."""
+    """The objective with the closest points and weights of an evaluation at unknowns (n_unknowns,).
+
+    Frozen, where its models are reduced ones.
+    """
     try:
         return frozen_posterior(objective, unknowns, evaluation)
     except ConfigurationError:

@@ -107,8 +107,8 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
     J^T W J + P, which for these least squares is the Fisher information of images and prior: J needs no later image but
     for the motion of what is prescribed. The noise in it is the one that the case states, or that the images show where
     an estimate begins. Elements are linear ones on the given meshes, so that this takes seconds; a modulus is guessed
-    as its tissue states it, else where the search begins. Layers round organs are free. Finite strains, the voxels'
-    place and the mesh are not in it. Raises as an estimate does.
+    as its tissue states it, else where the search begins. Layers round organs are free, and surfaces drawn alike.
+    Finite strains, the voxels' place and the mesh are not in it. Raises as an estimate does.
     """
     coarse = replace(case, mechanics=Mechanics("linear", "P1", solver=case.mechanics.solver))
     problem = joint_problem([on_linear_elements(body, coarse) for body in bodies], coarse, progress=progress)
@@ -122,8 +122,10 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
         if (kpa := stated.get(name)) is not None:
             guess[i] = float(np.log(kpa / objective.parameters.scale_kpa))
     fitted = fit_coefficients(objective, guess)
-    layers = {i: 1 for i, block in enumerate(objective.parameters.blocks) if block.choice is Choice.LAYERS}
-    free = objective.believing(objective.parameters.choosing(layers))
+    believed = {Choice.LAYERS: 1, Choice.DRAWING: 0}  # free, and drawn alike
+    blocks = objective.parameters.blocks
+    chosen = {i: believed[block.choice] for i, block in enumerate(blocks) if block.choice in believed}
+    free = objective.believing(objective.parameters.choosing(chosen))
     found = covariance_of(free, fitted.evaluation.under(free.parameters, fitted.unknowns), (), noise_of=noise_of)
     surfaces = [noise for (_, kind), noise in noise_of.items() if kind == "surface distance"]
     noise = surfaces[0] if surfaces else next(iter(noise_of.values()))

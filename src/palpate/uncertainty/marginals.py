@@ -17,7 +17,6 @@ from palpate.unknowns import Block, Choice
 
 CORRELATED = 1.5  # largest factor on a standard deviation by which residuals that are alike over surfaces count
 TAIL = 0.025  # on either side of a 95 % interval
-CAUSES = {Choice.PATCHINESS: "heterogeneity", Choice.LAYERS: "layer", Choice.FRAME: "frame", Choice.DRAWING: "offset"}
 TABLE = 4001  # places of ln E at which the coordinate is tabulated
 FLAT = 0.1  # least slope of a profile's root deviance beyond its end, over that at the estimate
 
@@ -47,64 +46,68 @@ def stated_mixture(mixture: Mixture, own: Covariance, blocks: tuple[Block, ...])
 
     Residuals are alike over surfaces in other ways than their number says: with the sandwich C_s and the posterior's
     covariance C of the likeliest explanation, every standard deviation is larger by the factor (C_s / C)^(1/2), 1 to
-    `CORRELATED`. What blocks that are held, the voxels' place and the mesh add is the same in all. Between explanations
-    the variance is that of their means (law of total variance), told by what distinguishes them.
+    `CORRELATED`. What blocks that are held, the voxels' place and the mesh add is the same in all. The variance is that
+    within explanations and that between their means (law of total variance). By how much it is larger than that of the
+    likeliest one is told by what distinguishes them.
     """
     first, held = mixture.explanations[0], sum(own.held.values(), np.zeros_like(own.prior))
-    sandwich, posterior = np.diag(own.noise + own.prior - held), np.diag(first.covariance)
-    factor = np.clip(np.sqrt(sandwich / posterior), 1.0, CORRELATED)
-    further = held + own.grid + own.mesh
+    sandwich, posterior = own.noise + own.prior - held, np.diag(first.covariance)
+    factor = np.clip(np.sqrt(np.diag(sandwich) / posterior), 1.0, CORRELATED)
     every = np.stack([np.outer(factor, factor) * of.covariance for of in mixture.explanations])
     weights, theta = mixture.weights, np.stack([of.theta for of in mixture.explanations])
-    within = np.tensordot(weights, every, axes=1)
-    scale = np.sqrt(np.diag(within) / sandwich)
-    scaled = np.outer(scale, scale)
-    between, causes = _between(mixture), dict[str, NDArray[np.float64]]()
+    within, away = np.tensordot(weights, every, axes=1), theta - mixture.mean
+    groups = _groups(mixture, blocks)
+    apart, variances = np.asarray((away.T * weights) @ away), np.diagonal(every, axis1=1, axis2=2)
+    between = _shared(apart, {cause: weights @ (of @ away) ** 2 for cause, of in groups.items()})
+    means = {cause: of @ variances for cause, of in groups.items()}
+    wider = _shared(within - every[0], {cause: weights @ (of - of[0]) for cause, of in means.items()})
+    told = sum(wider.values(), np.zeros_like(within))
+    scale = np.sqrt(np.diag(within - told) / np.diag(sandwich))
+    scaled, causes = np.outer(scale, scale), dict[str, NDArray[np.float64]]()
     for cause, part in own.causes.items():
         of_held = own.held.get(cause, np.zeros_like(part))
         causes[cause] = (part - of_held) * scaled + of_held
-    for cause, part in _causes_between(mixture, between, blocks).items():
+    for cause, part in (*between.items(), *wider.items()):
         causes[cause] = causes.get(cause, np.zeros_like(part)) + part
-    prior = (own.prior - held) * scaled + held + between
-    whole = replace(own, noise=own.noise * scaled, prior=prior, causes=causes)
-    return StatedMixture(weights, theta, every + further, whole)
+    noise, known = own.noise * scaled, held + own.grid + own.mesh
+    prior = within + apart + held - noise
+    whole = replace(own, noise=noise, prior=prior, causes=causes)
+    return StatedMixture(weights, theta, every + known, whole)
 
 
-def _between(mixture: Mixture) -> NDArray[np.float64]:
-    """Covariance (n, n) of theta between explanations."""
-    away = np.stack([of.theta for of in mixture.explanations]) - mixture.mean
-    return np.asarray((away.T * mixture.weights) @ away)
+def _groups(mixture: Mixture, blocks: tuple[Block, ...]) -> Mapping[str, NDArray[np.float64]]:
+    """By the causes of blocks whose alternatives distinguish explanations: how each averages over those that are alike.
 
-
-def _causes_between(
-    mixture: Mixture, between: NDArray[np.float64], blocks: tuple[Block, ...]
-) -> Mapping[str, NDArray[np.float64]]:
-    """Parts (n, n) of what is `between` explanations, by the causes of the blocks whose alternatives distinguish them.
-
-    A part has the share of each variance that the means of explanations with the same alternatives of these blocks
-    have, over the sum of all parts. What none of them tells apart are minima.
+    (k, k) times values (k, n) of the explanations is, for each, the mean over all with the same alternatives of these
+    blocks. What none of them tells apart are minima: each without the mean over those that are alike in all.
     """
-    weights, away = mixture.weights, np.stack([of.theta for of in mixture.explanations]) - mixture.mean
-    parts, tiny = dict[str, NDArray[np.float64]](), np.finfo(float).tiny
+    found, chosen = dict[str, NDArray[np.float64]](), [of.chosen for of in mixture.explanations]
+    weights = np.maximum(mixture.weights, np.finfo(float).tiny)
 
-    def means(keys: Sequence[object]) -> NDArray[np.float64]:
-        """The mean (k, n) of all explanations with the same key, of each."""
+    def averaging(keys: Sequence[object]) -> NDArray[np.float64]:
+        """Over explanations with the same key."""
         alike = np.array([[one == other for other in keys] for one in keys]) * weights
-        return np.asarray(alike @ away / np.maximum(alike.sum(axis=1, keepdims=True), tiny))
+        return np.asarray(alike / alike.sum(axis=1, keepdims=True))
 
-    for choice, cause in CAUSES.items():
+    for choice in (choice for choice in Choice if choice.of_tissues or choice.of_image):
         own = [i for i, block in enumerate(blocks) if block.choice is choice]
-        keys = [tuple(of.chosen.get(i, 0) for i in own) for of in mixture.explanations]
+        keys = [tuple(of.get(i, 0) for i in own) for of in chosen]
         if len(set(keys)) > 1:
-            parts[cause] = weights @ means(keys) ** 2
-    chosen = [tuple(sorted(of.chosen.items())) for of in mixture.explanations]
-    if len(set(chosen)) < len(chosen):
-        parts["minima"] = weights @ (away - means(chosen)) ** 2
-    total = np.maximum(sum(parts.values(), np.zeros(away.shape[1])), tiny)
+            found[blocks[own[0]].cause] = averaging(keys)
+    every = [tuple(sorted(of.items())) for of in chosen]
+    if len(set(every)) < len(every):
+        found["minima"] = np.eye(len(every)) - averaging(every)
+    return found
+
+
+def _shared(whole: NDArray[np.float64], parts: Mapping[str, NDArray[np.float64]]) -> Mapping[str, NDArray[np.float64]]:
+    """A covariance (n, n) by causes, whose variances are shared as `parts` (n,) are; nothing of a negative one."""
+    positive = {cause: np.maximum(part, 0.0) for cause, part in parts.items()}
+    total = np.maximum(sum(positive.values(), np.zeros(len(whole))), np.finfo(float).tiny)
     found = dict[str, NDArray[np.float64]]()
-    for cause, part in parts.items():
-        share = np.sqrt(part / total)
-        found[cause] = between * np.outer(share, share)
+    for cause, part in positive.items():
+        share = np.sqrt(part / total) * (np.diag(whole) > 0.0)
+        found[cause] = whole * np.outer(share, share)
     return found
 
 

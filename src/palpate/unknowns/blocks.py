@@ -148,7 +148,7 @@ class Block:
 
 
 def only(covariance: NDArray[np.float64]) -> tuple[Alternative, ...]:
-    """The alternatives of a block that has one prior."""
+    """The alternatives of a block that has one prior, of a covariance (n, n)."""
     return (Alternative(covariance),)
 
 

@@ -37,7 +37,7 @@ FIELD_MM = (110.0, 120.0, 120.0)
 POISSON_RATIO = 0.45
 SPREAD = 3.0  # the reduced model is made at the middle modulus, and at it times and over this factor
 SEARCHED = (0.1, 100.0)  # bounds of the moduli, relative to the surroundings
-REDUCED_ALONE = StopRule(step_sd=0.1, model_error=np.inf, derivatives=False)  # the full model is not asked again
+RULE = StopRule(step_sd=0.1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ class _Pair:
         problem = self.problem()
         bounds = Bounds(*np.log(np.outer(SEARCHED, np.ones(len(ORGANS)))))
         settings = InversionSettings((np.log(np.full(len(ORGANS), 2.0)),), bounds)
-        found = invert(problem, settings, progress=lambda _: None, rule=REDUCED_ALONE).minimum
+        found = invert(problem, settings, progress=lambda _: None, rule=RULE).minimum
         coefficients = problem.parameters.coefficients(found.unknowns)[0]
         bound = self.basis.error(LinearisationPoint(problem.parameters.moduli(found.unknowns), coefficients)).relative
         return _Estimate(SURROUNDINGS_KPA * np.exp(found.unknowns[: len(ORGANS)]), found.converged, bound)

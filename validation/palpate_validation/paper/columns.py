@@ -131,6 +131,6 @@ def entries_from_voxels(
 
 
 def _steps(inversion: Inversion) -> int:
-    """Accepted points on the way from the first start of the best minimum to the estimate."""
-    first = next(start for start in inversion.starts if start.candidate == inversion.best)
+    """Accepted points on the way of the first start, and on that to the estimate."""
+    first = inversion.starts[0]
     return len(first.minimum.history) + len(inversion.minimum.history)
