@@ -14,6 +14,7 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
 from palpate.study.samples import draw_moduli
+from palpate.study.stated_posterior import as_stated
 from palpate.study.verdicts import estimates_of, intervals_of, or_as_ratio, verdict
 from palpate.uncertainty import (
     FittedState,
