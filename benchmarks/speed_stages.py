@@ -22,13 +22,14 @@ STAGES = {  # functions whose time, with all that they call, is a stage of its o
     "wall modes": ("prescribed_motion.py", "prescribed_motion"),
     "stiffness assembled": ("linear_model.py", "linear_model"),
     "finite-strain model": ("finite_strain.py", "finite_strain_model"),
-    "minima near which all starts lead": ("starts.py", "started"),
-    "their ends": ("continuation.py", "continued"),
+    "responses and series": ("starts.py", "informed_start"),
+    "search": ("search.py", "searched"),
+    "minima to which all starts lead": ("starts.py", "started"),
+    "equilibrium at the linear estimate": ("estimate.py", "at_finite_strain"),
     "intervals and fits": ("estimation.py", "conclude"),
     "what would change the answer": ("variations.py", "what_would_change"),
 }
 WITHIN = {  # parts of the stages above
-    "responses and series": ("starts.py", "informed_start"),
     "tetrahedra remeshed": ("remeshing.py", "remeshed"),
     "tetrahedra smoothed": ("smoothing.py", "smoothed"),
     "closest points": ("surface_residuals.py", "_closest"),
