@@ -30,6 +30,7 @@ HALVINGS = 5  # of a step that leads to a state which cannot be solved, or to a 
 WORSE = 2.0  # rise of J at which a step is halved: closest points that slide over voxels make less
 FLOOR = 1e-4  # of ln E: a move that is always short enough
 MEMORY, DEPENDENT = 2, 1e-2  # earlier iterations that count; relative size of ways that count as dependent
+CALM = 0.4  # of ln of the residuals' scale: a change with which the noise still follows the search
 FEW = 8  # explanations that are compared while the search is far from its end
 
 
@@ -117,9 +118,9 @@ def searched(
     """The search followed from where it has `begun` until the posterior's mean moves no more by the `rule`.
 
     The noise is fitted anew until a step was no longer than a standard deviation, and once more where that led: fitted
-    further away, it has correlations of what is still motion. Then it stays, and so does the objective. begins
-    (n_unknowns,) each: where further minima are sought. A search that does not end by its rule says so in its
-    minimum's outcome. Raises `EstimationError`s of models that cannot be solved.
+    further away, it has correlations of what is still motion. When it has changed little, it stays, and so does the
+    objective. begins (n_unknowns,) each: where further minima are sought. A search that does not end by its rule says
+    so in its minimum's outcome. Raises `EstimationError`s of models that cannot be solved.
     """
     now = begin
     for number in range(1, rule.iterations + 1):
@@ -150,9 +151,15 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         return replace(now, objective=objective, minimum=minimum, mixture=mixture, moved=moved, settled=True)
     led = (*now.led[-MEMORY:], (theta, mixture.mean))
     target = _target(posterior, objective, mixture, np.clip(_fixed_point(led, sd), near.lower, near.upper))
-    settled = now.settled or exact
+    settled = now.settled or (exact and _calm(now.objective, objective))
     before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled, led=led)
     return _taken(before, evaluation, target)
+
+
+def _calm(before: Objective, objective: Objective) -> bool:
+    """Whether the noise of no observation changed much: far away it may be so large that every move is short."""
+    was, now = (np.log([o.weighting.sd for o in of.observations]) for of in (before, objective))
+    return bool(np.all(np.abs(now - was) < CALM))
 
 
 def _fixed_point(
