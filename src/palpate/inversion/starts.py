@@ -167,6 +167,8 @@ class _Responses:
 
     def projected(self, model: LinearModel, boundary: NDArray[np.float64]) -> Projection:
         """A model on its responses to combinations (n_boundary, k) of the modes, of which it is made."""
+        if not boundary.shape[1]:  # what stands alone is all there is
+            return projection(model, np.asarray(model.constraint.free.T @ self.alone, dtype=np.float64)[:, None])
         return projection(model, free_combinations(model, self.boundary, boundary.astype(np.float32)), overwrite=True)
 
     def basis(self, projected: Projection, material: NDArray[np.float64]) -> ReducedBasis:
