@@ -7,7 +7,7 @@ Of two moduli it is a region, drawn beside the ellipse.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,15 @@ from palpate.inversion import (
     Bounds,
     FixedCorrespondence,
     LeastSquares,
+    LinearisedObjective,
     Minimum,
     Objective,
+    Outcome,
     fixed_correspondence,
     gauss_newton,
+    posterior_sd,
+    with_correlations,
+    with_scales,
 )
 
 TRIALS = 12  # points on a ray from the estimate
@@ -30,6 +35,8 @@ JOINT_LEVEL = float(np.sqrt(special.chdtri(2, 0.05)))  # root deviance on its bo
 TRIES = 3  # searches at a point, each with as many steps as a minimum
 NEAR = 0.05  # of the level: accuracy of an end before a straight line corrects it
 FURTHEST = 2.0  # largest extrapolation, times the distance of the last point
+PASSES = 10
+SETTLED = 0.02  # posterior standard deviations
 TOLERANCE = 1e-6  # decrement of a minimum
 ON_RAY = 0.01  # decrement of a minimum on a ray; of the 1.92 at an end that is 0.25 % of the half-width
 
@@ -168,15 +175,23 @@ class Ray:
 
 
 def refitted(
-    objective: Objective, minimum: Minimum, bounds: Bounds, *, max_steps: int = 40
+    objective: Objective, minimum: Minimum, bounds: Bounds, *, max_steps: int = 40, passes: int = PASSES
 ) -> tuple[Minimum, FixedCorrespondence]:
     """The estimate that the residuals in a `minimum`'s evaluation lead to, and what it is the minimum of.
 
-    No model is solved. Raises `SolverError` where the approximation has no answer.
+    Noise and unknowns in turn, until no log-modulus moves by 0.02 of its standard deviation, `passes` times at the
+    most: where it still does, the minimum has the outcome `STEPS`. No model is solved. Raises `EstimationError` where
+    the residuals leave an unknown open, `SolverError` where the approximation has no answer.
     """
-    fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
-    found = gauss_newton(fixed, minimum.unknowns, bounds=bounds, tolerance=TOLERANCE, max_steps=max_steps)
-    return found, fixed
+    n, now = objective.n_parameters, minimum
+    for _ in range(passes):
+        objective = with_scales(with_correlations(objective, now.evaluation), now.evaluation)
+        weighed = LinearisedObjective(objective, now.unknowns, now.evaluation)(now.unknowns)
+        fixed = fixed_correspondence(objective, now.unknowns, weighed)
+        before, now = now, gauss_newton(fixed, now.unknowns, bounds=bounds, tolerance=TOLERANCE, max_steps=max_steps)
+        if np.all(np.abs(now.unknowns - before.unknowns)[:n] < SETTLED * posterior_sd(now, n)):
+            return now, fixed
+    return (replace(now, outcome=Outcome.STEPS) if now.converged else now), fixed
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,7 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.linear_model import LinearEquilibrium, LinearSystem, of_same_body, poisson_tangents
 from palpate.mechanics.newton import NewtonSettings
 from palpate.observation.contract import Imaged, OfMaterial, seen_by
-from palpate.uncertainty.profile import refitted
+from palpate.uncertainty.profile import PASSES, refitted
 
 TOLERANCE = 1e-6  # decrement of a minimum
 STEPS = 120  # at the most, for a modulus that moves far
@@ -64,14 +64,14 @@ class FastPath:
     least: Minimum
     bounds: Bounds
 
-    def under(self, errors: Errors) -> Shift:
-        """Where the estimate goes when the residuals of each observation change by e (n,) mm.
+    def under(self, errors: Errors, *, passes: int = PASSES) -> Shift:
+        """Where the estimate goes when the residuals of each observation change by e (n,) mm, noise, weights and all.
 
-        Raises as `refitted` does.
+        passes: see `refitted`, which also tells what is raised.
         """
         there = _moved(self.least.evaluation.linearisations, errors)
         moved = replace(self.least, evaluation=replace(self.least.evaluation, linearisations=there))
-        return self._shift(refitted(self.fixed.objective, moved, self.bounds, max_steps=STEPS)[0])
+        return self._shift(refitted(self.fixed.objective, moved, self.bounds, max_steps=STEPS, passes=passes)[0])
 
     def shift(self, errors: Errors = (), *, width: float = 1.0, dropped: NDArray[np.bool_] | None = None) -> Shift:
         """Where it goes under its own weights: with other residuals, another prior of the drivers, fewer modes.
