@@ -26,7 +26,7 @@ from palpate.unknowns.parameters import ParameterMap
 TRUSTED_SD = 0.5  # of ln E: how far residuals are taken for linear where explanations are compared first
 SEEN = 6.0  # of the log-evidence: explanations that are less likely than the best one by so much are left out
 MOST = 40  # explanations whose minimum is sought on the model, of all later images together
-FEWEST = 6  # the same, however many later images there are
+FEWEST = 10  # the same, however many later images there are
 ROUNDS = 4  # over all images, to find the likeliest alternatives of each
 MINIMUM = 1e-3  # decrement at which the minimum of an explanation ends: 0.045 sd from it, as a search does
 

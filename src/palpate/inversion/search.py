@@ -31,7 +31,6 @@ WORSE = 2.0  # rise of J at which a step is halved: closest points that slide ov
 FLOOR = 1e-4  # of ln E: a move that is always short enough
 MEMORY, DEPENDENT = 2, 1e-2  # earlier iterations that count; relative size of ways that count as dependent
 CALM = 0.4  # of ln of the residuals' scale: a change with which the noise still follows the search
-FEW = 8  # explanations that are compared while the search is far from its end
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +139,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     objective, evaluation = _fitted(now, near)
     posterior = cheapest_posterior(objective, at.unknowns, evaluation)
     exact = now.moved < 1.0
-    few = {} if exact else {"most": FEW}
-    mixture = mixture_of(posterior, at.unknowns, evaluation, bounds if exact else near, begins=begins, **few)
+    mixture = mixture_of(posterior, at.unknowns, evaluation, near, begins=begins)
     objective = objective.believing(objective.parameters.choosing(mixture.explanations[0].chosen))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
@@ -214,7 +212,7 @@ def _taken(now: Searched, evaluation: Evaluation, target: NDArray[np.float64]) -
     before = evaluation.under(objective.parameters, at.unknowns).value
     for _ in range(HALVINGS):
         try:
-            there = _exact(objective, evaluation.under(objective.parameters, at.unknowns), target, near=now.moved < 1.0)
+            there = _exact(objective, evaluation.under(objective.parameters, at.unknowns), target, near=now.settled)
         except (NotConverged, SolverError) as error:
             failure, target = error, at.unknowns + 0.5 * (target - at.unknowns)
             continue
