@@ -33,10 +33,10 @@ FIELD, LAYER = "field", "layer"
 BONDED = 1e-4  # standard deviation of a layer that is like its tissue, over that of one that is not
 LEAST_VARIANCE = 1e-3  # of a motion's coefficient, in its unit, so that no mode is excluded
 # standard deviation of ln E in a tissue that is nearly homogeneous, patchy, very patchy, over the stated one; and the
-# log prior odds of the three: 1, 0.15 and 0.15
+# log prior odds of the three: 1, 0.15 and 0.02
 PATCHINESS = {"nearly homogeneous": 1.0 / 3.0, "patchy": 1.0, "very patchy": 2.0}
 OF_A_MAP = (1.0, 1.0, 2.0)  # the same of a tissue that is mapped, which is never taken for homogeneous
-PATCHY_ODDS = (0.0, -1.9, -1.9)
+PATCHY_ODDS = (0.0, -1.9, -3.8)
 LAYER_ODDS = -1.9  # log prior odds that layers differ from their tissue: those of a patchy tissue
 
 
