@@ -212,7 +212,12 @@ def _taken(now: Searched, evaluation: Evaluation, target: NDArray[np.float64]) -
     before = evaluation.under(objective.parameters, at.unknowns).value
     for _ in range(HALVINGS):
         try:
-            there = _exact(objective, evaluation.under(objective.parameters, at.unknowns), target, near=now.settled)
+            there = _exact(
+                objective,
+                evaluation.under(objective.parameters, at.unknowns),
+                target,
+                near=now.settled or now.moved < 1.0,
+            )
         except (NotConverged, SolverError) as error:
             failure, target = error, at.unknowns + 0.5 * (target - at.unknowns)
             continue
