@@ -38,13 +38,11 @@ class LeastSquares(Protocol):
 class Outcome(StrEnum):
     """How an iteration ended; the value is the sentence that the user reads."""
 
-    CONVERGED = "the predicted decrease of the objective fell below its tolerance"
+    CONVERGED = "the search ended by its tolerance"
     STEPS = "the iteration reached its largest number of steps"
     STUCK = "no step reduced the objective; check the images and the fit of the driver's surface"
     UNSOLVABLE = "every shorter step led to a state that cannot be solved, for example with elements inside out"
     NOT_FINITE = "the objective is not a finite number; check the images and the moduli's bounds"
-    NO_EQUILIBRIUM = "the body has no equilibrium there under the material law"
-    NOT_FOLLOWED = "it could not be followed under the material law (log.txt says why)"
 
     @property
     def converged(self) -> bool:

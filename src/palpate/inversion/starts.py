@@ -236,9 +236,8 @@ def informed_combinations(
     """Combinations (n, k) of a block's unknowns that data of informations (n, n) see, and their inverse (k, n).
 
     Of a motion or a field whose prior is learned, at least the one that is seen most. Other unknowns stay as they are:
-    Poisson's ratios have a tissue each. With several
-    informations, those of a motion in several images, they are the eigenvectors for the mean, and so many that for none
-    of them more is left out.
+    Poisson's ratios have a tissue each. Several informations are those of a motion in several images: combinations are
+    then the eigenvectors for the mean, and so many that for none of them more is left out.
     """
     if not block.terms and block.choice not in (Choice.FRAME, Choice.PATCHINESS):
         return np.eye(block.size), np.eye(block.size)
