@@ -78,9 +78,8 @@ class FixedCorrespondence:
     def assembled(self, unknowns: NDArray[np.float64], linearisations: Sequence[Linearisation]) -> Evaluation:
         """J at `unknowns` (n_unknowns,) where its linearisations there are known."""
         found = self.objective.assembled(unknowns, linearisations)
-        away = float((unknowns - self.objective.parameters.prior_centre) @ found.prior_score)
         squares = sum(term.precision * float(term.weights @ term.residuals.values**2) for term in linearisations)
-        return replace(found, value=0.5 * (away + squares))
+        return replace(found, value=found.prior_value + 0.5 * squares)
 
 
 def fixed_correspondence(
@@ -170,9 +169,9 @@ class FrozenPosterior:
         With D_s = d z_s / dx the score is sum_s D_s^T Q_s z_s + P (x - m), the matrix sum_s D_s^T Q_s D_s + P.
         """
         parameters, prior = self.parameters, self.parameters.prior_matrix
-        moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
-        pull, modulus_slopes = prior @ away, parameters.derivatives(unknowns)
-        value, score, matrix, misfit = 0.5 * float(away @ pull), pull.copy(), prior.copy(), 0.0
+        moduli, modulus_slopes = parameters.moduli(unknowns), parameters.derivatives(unknowns)
+        believed, pull = parameters.prior(unknowns)
+        value, score, matrix, misfit = believed, pull.copy(), prior.copy(), 0.0
         for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
             there, own = state.reduced.solve(moduli, coefficients), parameters.unknowns_of(s)
             z = state.coordinates(there.amplitude, moduli, coefficients, parameters.offsets(unknowns, s))
@@ -182,7 +181,7 @@ class FrozenPosterior:
             score[own] += state.transposed_times(force[:, None], amplitude_slopes, modulus_slopes)[:, 0]
             halfway = state.transposed_times(state.form, amplitude_slopes, modulus_slopes)
             matrix[np.ix_(own, own)] += state.transposed_times(halfway.T, amplitude_slopes, modulus_slopes)
-        return Evaluation(value, misfit, score, matrix, (), prior, pull, parameters.images)
+        return Evaluation(value, misfit, score, matrix, (), prior, pull, parameters.images, believed)
 
 
 def frozen_posterior(

@@ -7,7 +7,7 @@ posterior is nearly normal. The probability of an explanation is its evidence, b
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,10 @@ from palpate.errors import EstimationError, SolverError
 from palpate.inversion.by_image import Images, among, log_determinant
 from palpate.inversion.frozen_posterior import Posterior
 from palpate.inversion.objective import Evaluation
-from palpate.inversion.optimise import Bounds, Minimum, gauss_newton, same_minimum
+from palpate.inversion.optimise import Bounds, Minimum, gauss_newton, posterior_sd, same_minimum
 from palpate.inversion.scenarios import Alternatives, alternatives_of, scenarios_of
 from palpate.parallel import mapped
-from palpate.unknowns.parameters import ParameterMap
+from palpate.unknowns.parameters import ParameterMap, Volume
 
 TRUSTED_SD = 0.5  # of ln E: how far residuals are taken for linear where explanations are compared first
 SEEN = 6.0  # of the log-evidence: explanations that are less likely than the best one by so much are left out
@@ -29,6 +29,8 @@ MOST = 40  # explanations whose minimum is sought on the model, of all later ima
 FEWEST = 10  # the same, however many later images there are
 ROUNDS = 4  # over all images, to find the likeliest alternatives of each
 MINIMUM = 1e-3  # decrement at which the minimum of an explanation ends: 0.045 sd from it, as a search does
+VOLUMES, VOLUME_SD, AT_ONCE = 3, 0.1, 0.8  # searches with the room of all others, its accuracy in sd, ln E a search
+DIFFERENCE = 0.05  # of ln E: step of derivatives of that room
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,11 @@ class Explanation:
     weight: float
     theta: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    volume: Volume | None = None
+
+    def prior(self, parameters: ParameterMap) -> ParameterMap:
+        """The unknowns as it believes them."""
+        return replace(parameters.choosing(dict(self.chosen)), volume=self.volume)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +134,7 @@ def mixture_of(
             float(weight),
             each.minimum.unknowns[:n],
             each.minimum.evaluation.covariance_columns(n)[:n],
+            each.volume,
         )
         for each, weight in zip(found, weights, strict=False)
     ]
@@ -156,28 +164,57 @@ class _Laplace:
 
     of: _Compared
     minimum: Minimum
+    volume: Volume | None
     level: float
 
 
 def _laplace(posterior: Posterior, of: _Compared, begin: NDArray[np.float64], bounds: Bounds) -> _Laplace | None:
     """An explanation's minimum, sought from unknowns (n_unknowns,); None where the model cannot be solved there.
 
+    It is that of the marginal posterior of theta, J + 1/2 ln det H_yy with all other unknowns y at their best: that of
+    J alone lies where these have most room, which soft organs leave them (Cox & Reid, J. R. Stat. Soc. B 49 (1987) 1).
     The log-evidence is -J - 1/2 ln det H + 1/2 ln det P, H = J^T W J + P.
     """
-    parameters = posterior.parameters.choosing(dict(of.chosen))
-    n, start = parameters.n_parameters, begin.copy()
+    own = posterior.believing(replace(posterior.parameters.choosing(dict(of.chosen)), volume=None))
+    n, start, images = own.n_parameters, begin.copy(), own.parameters.images
     start[:n] = np.clip(start[:n], bounds.lower, bounds.upper)
     try:
-        minimum = gauss_newton(posterior.believing(parameters), start, bounds=bounds, tolerance=MINIMUM)
+        minimum = gauss_newton(own, start, bounds=bounds, tolerance=MINIMUM)
+        for _ in range(VOLUMES if own.parameters.n_coefficients else 0):
+            theta, sd = minimum.unknowns[:n], posterior_sd(minimum, n)
+            own = own.believing(replace(own.parameters, volume=_volume(own, minimum)))
+            within = Bounds(np.maximum(bounds.lower, theta - AT_ONCE), np.minimum(bounds.upper, theta + AT_ONCE))
+            minimum = gauss_newton(own, minimum.unknowns, bounds=within, tolerance=MINIMUM)
+            if np.all(np.abs(minimum.unknowns[:n] - theta) < VOLUME_SD * sd):
+                break
     except SolverError:
         return None
-    if not np.isfinite(minimum.evaluation.value):
+    there, theta = minimum.evaluation, minimum.unknowns[:n]
+    if not np.isfinite(there.value):
         return None
-    there, images = minimum.evaluation, parameters.images
-    determinants = log_det(parameters.nuisance_precision, tuple(own - n for own in images)) - log_det(
-        there.matrix, images
-    )
-    return _Laplace(of, minimum, of.log_prior + of.several + 0.5 * determinants - there.value)
+    parameters, precision = own.parameters, there.matrix.copy()
+    precision[np.arange(n), np.arange(n)] += 12.0 / (bounds.upper - bounds.lower) ** 2  # no more room than the bounds
+    believed = log_det(parameters.nuisance_precision, tuple(numbers - n for numbers in images))
+    determinants = believed - log_det(precision, images)
+    added = 0.0 if parameters.volume is None else parameters.volume.at(theta)[0]
+    level = of.log_prior + of.several + 0.5 * determinants - (there.value - added)
+    return _Laplace(of, minimum, parameters.volume, level)
+
+
+def _volume(posterior: Posterior, minimum: Minimum) -> Volume:
+    """How 1/2 ln det H_yy changes with theta at a minimum, by differences."""
+    n, images = posterior.n_parameters, tuple(own - posterior.n_parameters for own in minimum.evaluation.images)
+
+    def room(matrix: NDArray[np.float64]) -> float:
+        """1/2 ln det H_yy."""
+        return 0.5 * log_det(matrix[n:, n:], images)
+
+    here, slope = room(minimum.evaluation.matrix), np.zeros(n)
+    for i in range(n):
+        there = minimum.unknowns.copy()
+        there[i] += DIFFERENCE
+        slope[i] = (room(posterior(there).matrix) - here) / DIFFERENCE
+    return Volume(slope, minimum.unknowns[:n])
 
 
 def log_det(matrix: NDArray[np.float64], images: Images = ()) -> float:

@@ -86,7 +86,8 @@ class Evaluation:
 
     matrix (n, n) = J^T W J + P and score (n,) = J^T W r + P (x - m) with the Jacobians J of smooth surfaces: the
     estimate is where the score vanishes. prior (n, n): P, the precision of the unknowns before the images are seen;
-    prior_score (n,): its part of the score. images: the unknowns that belong to each of several images alone.
+    prior_value,
+    prior_score (n,): its part of value and score. images: the unknowns that belong to each of several images alone.
     """
 
     value: float
@@ -97,6 +98,7 @@ class Evaluation:
     prior: NDArray[np.float64]
     prior_score: NDArray[np.float64]
     images: Images = ()
+    prior_value: float = 0.0
 
     def covariance_columns(self, n_parameters: int) -> NDArray[np.float64]:
         """H^-1 [e_1, ..., e_k] (n, k) of the first k unknowns, the log-moduli, with the Gauss-Newton matrix H.
@@ -115,14 +117,15 @@ class Evaluation:
 
     def under(self, parameters: ParameterMap, unknowns: NDArray[np.float64]) -> Evaluation:
         """The same at `unknowns` (n_unknowns,), where it is of, under another prior of these."""
-        value, pull = _prior(parameters, unknowns)
-        before, prior = 0.5 * float(self.prior_score @ (unknowns - parameters.prior_centre)), parameters.prior_matrix
+        value, pull = parameters.prior(unknowns)
+        prior = parameters.prior_matrix
         return replace(
             self,
-            value=self.value - before + value,
+            value=self.value - self.prior_value + value,
             score=self.score - self.prior_score + pull,
             matrix=self.matrix - self.prior + prior,
             prior=prior,
+            prior_value=value,
             prior_score=pull,
         )
 
@@ -209,16 +212,17 @@ class Objective:
 
     def assembled(self, unknowns: NDArray[np.float64], linearisations: Sequence[Linearisation]) -> Evaluation:
         """The evaluation at `unknowns` (n_unknowns,) from all observations' residuals there, with their derivatives."""
-        value, pull = _prior(self.parameters, unknowns)
+        believed, pull = self.parameters.prior(unknowns)
         prior = self.parameters.prior_matrix
-        score, matrix, misfit = pull.copy(), prior.copy(), 0.0
+        value, score, matrix, misfit = believed, pull.copy(), prior.copy(), 0.0
         for term in linearisations:
             score[term.columns] += term.score
             matrix[np.ix_(term.columns, term.columns)] += term.information
             loss = float(term.residuals.weights @ term.observation.weighting.loss.rho(term.residuals.values))
             misfit += loss / len(linearisations)
             value += 0.5 * term.precision * loss
-        return Evaluation(value, misfit, score, matrix, tuple(linearisations), prior, pull, self.parameters.images)
+        images = self.parameters.images
+        return Evaluation(value, misfit, score, matrix, tuple(linearisations), prior, pull, images, believed)
 
     def weighed(
         self, unknowns: NDArray[np.float64], linearisations: Sequence[Linearisation], like: Sequence[Linearisation]
@@ -345,9 +349,3 @@ def _robust_weights(observation: Observation, residuals: Residuals) -> NDArray[n
     """The weights (n,) of residuals, times the robust weights of the loss."""
     return np.asarray(residuals.weights * observation.weighting.loss.weight(residuals.values))
 
-
-def _prior(parameters: ParameterMap, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-    """1/2 (x - m)^T P (x - m) and its gradient (n_unknowns,)."""
-    away = unknowns - parameters.prior_centre
-    pull = parameters.prior_matrix @ away
-    return 0.5 * float(away @ pull), pull

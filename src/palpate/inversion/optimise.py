@@ -19,6 +19,7 @@ RADIUS = 2.0  # largest trust radius of the log-moduli; the first one is half of
 LEAST_DAMPING = 0.1  # of the diagonal: with less the step is nearly the refused one
 BAD = 0.25  # of the promised reduction: below, the radius shrinks; above 1 - 0.25 it grows (Nocedal & Wright, Alg. 4.1)
 TRIALS = 12  # trials of a step before it fails
+AT_BOUND = 1e-9  # of ln E: rounding of a mean of values at a bound
 SAME_MINIMUM = 0.02  # of ln E: minima that are nearer to each other count as one
 
 
@@ -59,7 +60,7 @@ class Bounds:
 
     def reached(self, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which of theta (n_parameters,) lie at a bound: what holds them there is the search, not the images."""
-        return np.asarray((theta <= self.lower) | (theta >= self.upper))
+        return np.asarray((theta <= self.lower + AT_BOUND) | (theta >= self.upper - AT_BOUND))
 
     def fixed(self, theta: NDArray[np.float64], which: NDArray[np.bool_]) -> Bounds:
         """Those between which the log-moduli `which` (n_parameters,) keep their values theta (n_parameters,)."""

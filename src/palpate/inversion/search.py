@@ -140,7 +140,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     posterior = cheapest_posterior(objective, at.unknowns, evaluation)
     exact = now.moved < 1.0
     mixture = mixture_of(posterior, at.unknowns, evaluation, near, begins=begins)
-    objective = objective.believing(objective.parameters.choosing(mixture.explanations[0].chosen))
+    objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
     if exact and moved < rule.step_sd:

@@ -17,6 +17,7 @@ from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 from palpate.unknowns.blocks import KNOWN_MODULUS, Acts, Block, in_series, in_series_slopes, joined
 
 LOADS = "the known loads"
+LEVELS_OFF = 1.5  # of ln E: distance from a place at which the room that theta leaves all others levels off
 
 
 def eta_of_ratio(ratio: float) -> float:
@@ -100,6 +101,23 @@ class _Layout:
 
 
 @dataclass(frozen=True, slots=True)
+class Volume:
+    """How much room theta leaves all other unknowns, v = 1/2 ln det H_yy of their Gauss-Newton matrix, near a place.
+
+    v(theta) = sum_i g_i l tanh((theta_i - c_i) / l) with the slope g (n_parameters,) at c (n_parameters,), l =
+    `LEVELS_OFF`: where an organ is so stiff, or so soft, that its modulus hardly matters, the room stays as it is.
+    """
+
+    slope: NDArray[np.float64]
+    centre: NDArray[np.float64]
+
+    def at(self, theta: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """V at theta (n_parameters,), and its derivatives (n_parameters,)."""
+        away = np.tanh((theta - self.centre) / LEVELS_OFF)
+        return float(LEVELS_OFF * self.slope @ away), np.asarray(self.slope * (1.0 - away**2))
+
+
+@dataclass(frozen=True, slots=True)
 class ParameterMap:
     """Unknowns x = [theta, x_1, ..., x_B] (n_unknowns,): the parameters theta, then those of the `blocks`.
 
@@ -112,7 +130,8 @@ class ParameterMap:
 
     The prior is normal: theta with `prior_mean` (n_parameters,) and `prior_precision` (n_parameters, n_parameters),
     flat by default, the blocks' unknowns with the mean 0 and `nuisance_precision` (n_coefficients, n_coefficients), by
-    default what the blocks believe. Raises `ConfigurationError` for a prior of another shape.
+    default what the blocks believe. `volume`: what integrating over the blocks' unknowns adds to J as a function of
+    theta; None: nothing, the blocks' unknowns are sought. Raises `ConfigurationError` for a prior of another shape.
     """
 
     base: NDArray[np.float64]
@@ -125,6 +144,7 @@ class ParameterMap:
     prior_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     nuisance_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     poisson: tuple[OpenPoisson, ...] = ()
+    volume: Volume | None = None
     _layout: _Layout = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -213,6 +233,16 @@ class ParameterMap:
         """Mean (n_unknowns,) of all unknowns before the images are seen."""
         return np.concatenate([self.prior_mean, np.zeros(self.n_coefficients)])
 
+    def prior(self, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """1/2 (x - m)^T P (x - m) + v(theta) at unknowns x (n_unknowns,), and its gradient (n_unknowns,)."""
+        away, n = unknowns - self.prior_centre, self.n_parameters
+        pull = self.prior_matrix @ away
+        value = 0.5 * float(away @ pull)
+        if self.volume is not None:
+            added, slope = self.volume.at(unknowns[:n])
+            value, pull[:n] = value + added, pull[:n] + slope
+        return value, pull
+
     def moduli(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """The regions' moduli (n_regions,) kPa at unknowns (n_unknowns,), or at theta (n_parameters,) alone.
 
@@ -294,7 +324,8 @@ class ParameterMap:
         own = np.concatenate([np.arange(self.n_parameters), *(self.columns(i) for i in kept)])
         nuisance = own[self.n_parameters :] - self.n_parameters
         precision = self.nuisance_precision[np.ix_(nuisance, nuisance)]
-        return replace(self, blocks=blocks, nuisance_precision=precision), own
+        share = self.volume and replace(self.volume, slope=self.volume.slope / self.n_states)
+        return replace(self, blocks=blocks, nuisance_precision=precision, volume=share), own
 
     def _model_columns(self, state: int) -> NDArray[np.int64]:
         return np.concatenate([self.acting(Acts.BOUNDARY, state), self.acting(Acts.MATERIAL, state)])
