@@ -30,6 +30,7 @@ FEWEST = 10  # the same, however many later images there are
 ROUNDS = 4  # over all images, to find the likeliest alternatives of each
 MINIMUM = 1e-3  # decrement at which the minimum of an explanation ends: 0.045 sd from it, as a search does
 VOLUMES, VOLUME_SD, AT_ONCE = 3, 0.1, 0.8  # searches with the room of all others, its accuracy in sd, ln E a search
+AS_NEAR = 0.1  # of ln E: places that are as near to an explanation
 DIFFERENCE = 0.05  # of ln E: step of derivatives of that room
 
 
@@ -38,7 +39,9 @@ class Explanation:
     """A scenario with the alternatives of every later image, its probability, and the posterior of theta under it.
 
     chosen: numbers of the alternatives, by block; scenario, images: in words; theta (n_parameters,) and covariance
-    (n_parameters, n_parameters): of the log-moduli, normal.
+    (n_parameters, n_parameters): of the log-moduli, normal; volume: of all other unknowns there; level: log of the
+    probability but for a constant; away: how far theta lies from where the models were exact, of ln E; number: of the
+    minimum, where it has several; minimum: that of all unknowns.
     """
 
     chosen: Mapping[int, int]
@@ -48,6 +51,15 @@ class Explanation:
     theta: NDArray[np.float64]
     covariance: NDArray[np.float64]
     volume: Volume | None = None
+    level: float = 0.0
+    away: float = 0.0
+    number: int = 0
+    minimum: Minimum | None = field(default=None, repr=False)
+
+    @property
+    def key(self) -> tuple[int, tuple[tuple[int, int], ...]]:
+        """What it chooses, and which of its minima it is."""
+        return self.number, tuple(sorted(self.chosen.items()))
 
     def prior(self, parameters: ParameterMap) -> ParameterMap:
         """The unknowns as it believes them."""
@@ -86,6 +98,20 @@ class Mixture:
         """(n_parameters,) of theta."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
+    def beside(self, earlier: Mixture) -> Mixture:
+        """The same with explanations as an `earlier` mixture knows them, where its models were exact nearer to them.
+
+        Patchy tissues seem to explain more where responses to patches are those of other moduli: of each explanation
+        that place counts where it was known best, else a search goes to and fro between two of them.
+        """
+        known = {of.key: of for of in earlier.explanations}
+        nearest = [
+            known[of.key] if of.key in known and known[of.key].away < of.away - AS_NEAR else of
+            for of in self.explanations
+        ]
+        there = {of.key for of in nearest}
+        return _weighed([*nearest, *(of for key, of in known.items() if key not in there)])
+
     def probabilities(self, block: int) -> dict[int, float]:
         """Of the alternatives of a block that has any, by their numbers."""
         found = dict[int, float]()
@@ -103,13 +129,15 @@ def mixture_of(
     *,
     begins: Sequence[NDArray[np.float64]] = (),
     most: int = MOST,
+    constant: float = 0.0,
 ) -> Mixture:
     """The posterior of theta over all explanations.
 
     First every explanation is compared with the residuals linear around unknowns (n_unknowns,), within `TRUSTED_SD`
     there (see `LinearEvidence`). Then the minimum of the likeliest, `most` at most, is found on the `posterior`,
     however far, with the evidence there. begins (n_unknowns,) each: where further minima of the likeliest explanation
-    are sought. Raises `EstimationError` where images and prior leave an unknown open, or no minimum can be solved for.
+    are sought; constant: what the objective is more than the `posterior`. Raises `EstimationError` where images and
+    prior leave an unknown open, or no minimum can be solved for.
     """
     n = posterior.n_parameters
     with determined():
@@ -123,22 +151,34 @@ def mixture_of(
         others = [other.minimum for other in found if other.of is likeliest.of]
         if each is not None and not any(same_minimum(each.minimum.unknowns, other, n) for other in others):
             found.append(each)
-    found.sort(key=lambda each: -each.level)
-    weights = np.exp([each.level - found[0].level for each in found])
-    weights = weights[weights > 0.0] / weights.sum()
+    away = [float(np.abs(each.minimum.unknowns - unknowns)[:n].max(initial=0.0)) for each in found]
     explanations = [
         Explanation(
             dict(each.of.chosen),
             each.of.scenario,
             each.of.images,
-            float(weight),
+            0.0,
             each.minimum.unknowns[:n],
             each.minimum.evaluation.covariance_columns(n)[:n],
             each.volume,
+            each.level - constant,
+            distance,
+            sum(other.of is each.of for other in found[:i]),
+            each.minimum,
         )
-        for each, weight in zip(found, weights, strict=False)
+        for i, (each, distance) in enumerate(zip(found, away, strict=True))
     ]
-    return Mixture(tuple(explanations), found[0].minimum)
+    return _weighed(explanations)
+
+
+def _weighed(explanations: Sequence[Explanation]) -> Mixture:
+    """The mixture of explanations by their levels; those of no weight are left out."""
+    ordered = sorted(explanations, key=lambda of: -of.level)
+    weights = np.exp([of.level - ordered[0].level for of in ordered])
+    kept = [replace(of, weight=w / weights.sum()) for of, w in zip(ordered, weights.tolist(), strict=True) if w > 0.0]
+    minimum = kept[0].minimum
+    assert minimum is not None, "explanations of a search have minima"
+    return Mixture(tuple(kept), minimum)
 
 
 @dataclass(frozen=True, slots=True)

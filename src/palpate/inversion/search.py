@@ -139,7 +139,9 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     objective, evaluation = _fitted(now, near)
     posterior = cheapest_posterior(objective, at.unknowns, evaluation)
     exact = now.moved < 1.0
-    mixture = mixture_of(posterior, at.unknowns, evaluation, near, begins=begins)
+    constant = evaluation.value - posterior(at.unknowns).value  # of residuals that count less the larger they are
+    mixture = mixture_of(posterior, at.unknowns, evaluation, near, begins=begins, constant=constant)
+    mixture = mixture.beside(now.mixture) if now.settled and now.mixture else mixture
     objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
