@@ -45,7 +45,7 @@ def test_the_frozen_posterior_has_the_value_and_score_of_the_objective_where_it_
 def test_in_the_driver_the_frozen_posterior_is_the_quadratic_of_gauss_newton(objective, minimum, rng):
     frozen, evaluation = frozen_posterior(objective, minimum), objective(minimum)
     step = np.concatenate([np.zeros(2), 0.1 * rng.standard_normal(len(minimum) - 2)])
-    expected = evaluation.value + evaluation.score @ step + 0.5 * step @ evaluation.matrix @ step
+    expected = evaluation.value + evaluation.score @ step + 0.5 * step @ (evaluation.matrix @ step)
     assert frozen(minimum + step).value == pytest.approx(expected, rel=1e-9)
 
 

@@ -15,12 +15,13 @@ from scipy import linalg
 
 from palpate.approximation.contract import determined
 from palpate.errors import EstimationError, SolverError
-from palpate.inversion.by_image import Images, among, log_determinant
 from palpate.inversion.frozen_posterior import Posterior
 from palpate.inversion.objective import Evaluation
 from palpate.inversion.optimise import Bounds, Minimum, gauss_newton, same_minimum
 from palpate.inversion.scenarios import Alternatives, alternatives_of, scenarios_of
 from palpate.parallel import mapped
+from palpate.unknowns.arrowhead import Arrowhead, forward
+from palpate.unknowns.blocks import Alternative
 from palpate.unknowns.parameters import ParameterMap
 
 TRUSTED_SD = 0.5  # of ln E: how far residuals are taken for linear where explanations are compared first
@@ -173,32 +174,63 @@ def _laplace(posterior: Posterior, of: _Compared, begin: NDArray[np.float64], bo
         return None
     if not np.isfinite(minimum.evaluation.value):
         return None
-    there, images = minimum.evaluation, parameters.images
-    determinants = log_det(parameters.nuisance_precision, tuple(own - n for own in images)) - log_det(
-        there.matrix, images
-    )
+    there = minimum.evaluation
+    determinants = sum(of.log_determinant for of in parameters.priors) - log_det(there.matrix)
     return _Laplace(of, minimum, of.log_prior + of.several + 0.5 * determinants - there.value)
 
 
-def log_det(matrix: NDArray[np.float64], images: Images = ()) -> float:
-    """Ln det of a positive definite matrix (n, n), without the unknowns that nothing depends on."""
-    seen = np.diag(matrix) > 0.0
-    return log_determinant(matrix[np.ix_(seen, seen)], among(images, seen)) if seen.any() else 0.0
+def log_det(matrix: Arrowhead) -> float:
+    """Ln det of a positive definite matrix, without the unknowns that nothing depends on."""
+    return matrix.grounded().log_determinant()
 
 
 @dataclass(frozen=True, slots=True)
 class _Eliminated:
-    """What an image's own unknowns y, under one of its alternatives, take from the shared ones.
+    """What an image's own unknowns y, under one of its alternatives P, take from the shared ones.
 
-    across (n_own, n_shared): X = (A_yy + P)^-1 A_ys; own (n_own,): z = (A_yy + P)^-1 b_y; taken (n_shared, n_shared)
-    and pull (n_shared,): A_sy X and A_sy z; level: 1/2 (b_y^T z - ln det(A_yy + P) + ln det P) with the log prior odds.
+    taken (n_shared, n_shared) and pull (n_shared,): A_sy (A_yy + P)^-1 A_ys and A_sy (A_yy + P)^-1 b_y; level: 1/2
+    (b_y^T (A_yy + P)^-1 b_y - ln det(A_yy + P) + ln det P) with the log prior odds. own (n_own,): their numbers in the
+    order in which they are eliminated, by `steps`.
     """
 
-    across: NDArray[np.float64]
-    own: NDArray[np.float64]
+    own: NDArray[np.int64]
+    steps: tuple[_Step, ...]
     taken: NDArray[np.float64]
     pull: NDArray[np.float64]
     level: float
+
+    def following(self, of_shared: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The unknowns `own` (n_own,) at their best beside shared ones (n_shared,)."""
+        found = np.append(of_shared, -1.0)
+        for step in reversed(self.steps):
+            half = -step.border @ found
+            found = np.concatenate(
+                [linalg.solve_triangular(step.factor, half, lower=True, trans="T", check_finite=False), found]
+            )
+        return found[: len(self.own)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """A block of m unknowns eliminated before n others that follow, and a right-hand side.
+
+    factor L (m, m) of their matrix with its prior; border (m, n + 1): L^-1 of their rows of the others and the
+    right-hand side; left (n + 1, n + 1): what is left of these; determinant: ln det of the prior less that of L L^T.
+    """
+
+    factor: NDArray[np.float64]
+    border: NDArray[np.float64]
+    left: NDArray[np.float64]
+    determinant: float
+
+    @classmethod
+    def of(cls, matrix: NDArray[np.float64], prior: Alternative) -> _Step:
+        """The first m unknowns of a matrix (m + n + 1, m + n + 1) under their prior."""
+        m = len(prior.covariance)
+        factor = linalg.cholesky(matrix[:m, :m] + prior.precision, lower=True, check_finite=False)
+        border = forward(factor, matrix[:m, m:])
+        determinant = prior.log_determinant - 2.0 * float(np.log(np.diag(factor)).sum())
+        return cls(factor, border, matrix[m:, m:] - border.T @ border, determinant)
 
 
 def _likeliest_together(gains: Sequence[Mapping[int, float]], most: int) -> dict[tuple[int, ...], float]:
@@ -229,36 +261,43 @@ class LinearEvidence:
         """That of residuals linear around unknowns (n_unknowns,), where moduli are trusted within `TRUSTED_SD`."""
         n, data = parameters.n_parameters, evaluation.matrix - evaluation.prior
         pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
-        data[np.arange(n), np.arange(n)] += TRUSTED_SD**-2.0
+        data = data.plus([(np.arange(n), TRUSTED_SD**-2.0 * np.eye(n))])
         pull[:n] += TRUSTED_SD**-2.0 * unknowns[:n]
         owns = [parameters.of_image(state) for state in range(parameters.n_states)]
         shared = np.setdiff1d(np.arange(len(pull)), np.concatenate(owns))
-        images = [tuple(cls._eliminated(parameters, data, pull, s, own, shared)) for s, own in enumerate(owns)]
-        return cls(parameters, shared, data[np.ix_(shared, shared)], pull[shared], tuple(images))
+        images = [tuple(cls._eliminated(parameters, data, pull, s, shared)) for s in range(parameters.n_states)]
+        return cls(parameters, shared, data.block(shared, shared), pull[shared], tuple(images))
 
     @staticmethod
     def _eliminated(
         parameters: ParameterMap,
-        data: NDArray[np.float64],
+        data: Arrowhead,
         pull: NDArray[np.float64],
         state: int,
-        own: NDArray[np.int64],
         shared: NDArray[np.int64],
     ) -> Iterator[tuple[Alternatives, _Eliminated]]:
-        """Each alternative of a later state with what its own unknowns take."""
-        across, information, centre = data[np.ix_(own, shared)], data[np.ix_(own, own)], parameters.prior_centre[own]
-        for alternatives in alternatives_of(parameters.blocks, state):
-            prior = parameters.choosing(dict(alternatives.chosen)).prior_matrix[np.ix_(own, own)]
-            pulled = pull[own] + prior @ centre
-            factor = linalg.cho_factor(information + prior, lower=True, check_finite=False)
-            answer = linalg.cho_solve(factor, np.column_stack([across, pulled]), check_finite=False)
-            determinants = log_det(prior) - 2.0 * float(np.log(np.diag(factor[0])).sum())
-            level = 0.5 * (float(pulled @ answer[:, -1]) - float(centre @ prior @ centre) + determinants)
-            taken = across.T @ answer
-            yield (
-                alternatives,
-                _Eliminated(answer[:, :-1], answer[:, -1], taken[:, :-1], taken[:, -1], level + alternatives.log_odds),
-            )
+        """Each alternative of a later state with what its own unknowns take.
+
+        Block after block is eliminated, those that may be otherwise last: alternatives that begin alike share it.
+        """
+        every = alternatives_of(parameters.blocks, state)
+        open_ = list(dict.fromkeys(i for alternatives in every for i, _ in alternatives.chosen))
+        blocks = [*(i for i in parameters.blocks_of_image(state) if i not in open_), *open_]
+        own = np.concatenate([np.zeros(0, dtype=np.int64), *(parameters.columns(i) for i in blocks)])
+        border = np.column_stack([data.block(own, shared), pull[own]])
+        corner = np.zeros((border.shape[1],) * 2)
+        whole, known = np.block([[data.block(own, own), border], [border.T, corner]]), dict[tuple[int, ...], _Step]()
+        for alternatives in every:
+            chosen, steps, path = dict(alternatives.chosen), list[_Step](), tuple[int, ...]()
+            for i in blocks:
+                path = (*path, chosen.get(i, -1))
+                if path not in known:
+                    prior = parameters.blocks[i].alternatives[chosen[i]] if i in chosen else parameters.priors[i]
+                    known[path] = _Step.of(steps[-1].left if steps else whole, prior)
+                steps.append(known[path])
+            left = steps[-1].left if steps else corner
+            level = 0.5 * (sum(step.determinant for step in steps) - float(left[-1, -1])) + alternatives.log_odds
+            yield alternatives, _Eliminated(own, tuple(steps), -left[:-1, :-1], -left[:-1, -1], level)
 
     def compared(self, most: int) -> list[_Compared]:
         """The likeliest explanations, `most` at most: of each scenario the likeliest, and others of its images.
@@ -276,9 +315,9 @@ class LinearEvidence:
     def _of_scenario(self, scenario: Alternatives, most: int) -> list[_Compared]:
         """Its likeliest explanation, and those that are seen beside it, `most` at most."""
         parameters, shared = self.parameters.choosing(dict(scenario.chosen)), self.shared
-        prior, centre = parameters.prior_matrix[np.ix_(shared, shared)], parameters.prior_centre[shared]
+        prior, centre = parameters.prior_matrix.block(shared, shared), parameters.prior_centre[shared]
         n = parameters.n_parameters
-        own = 0.5 * (log_det(prior[n:, n:]) - float(centre @ prior @ centre)) + scenario.log_odds
+        own = 0.5 * (log_det(Arrowhead.of(prior[n:, n:])) - float(centre @ prior @ centre)) + scenario.log_odds
         information, pull = self.information + prior, self.pull + prior @ centre
 
         def evidence(numbers: Sequence[int]) -> float:
@@ -331,8 +370,8 @@ class LinearEvidence:
         of_shared = linalg.solve(matrix, pull - sum(part.pull for _, part in parts), assume_a="pos")
         unknowns = np.empty(self.parameters.n_unknowns)
         unknowns[self.shared] = of_shared
-        for state, (_, part) in enumerate(parts):
-            unknowns[self.parameters.of_image(state)] = part.own - part.across @ of_shared
+        for _, part in parts:
+            unknowns[part.own] = part.following(of_shared)
         chosen = scenario.chosen + tuple(pair for of, _ in parts for pair in of.chosen)
         odds = scenario.log_odds + sum(of.log_odds for of, _ in parts)
         words = tuple(of.words for of, _ in parts)

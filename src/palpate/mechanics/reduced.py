@@ -215,9 +215,11 @@ class ReducedEquilibrium(DenseEquilibrium):
     def _modulus_forces(self) -> NDArray[np.float64]:
         """E_r (A_r a + B_r [q, 1]), (m, n_regions) mN."""
         model = self.system.model
-        forces = model.stiffness @ self.amplitude
-        forces += model.coupling @ np.append(self.coefficients[: model.n_boundary], 1.0)
-        return np.asarray((self.system.moduli[:, None] * forces).T)
+        given = np.append(self.coefficients[: model.n_boundary], 1.0)
+        # as one matrix each, for products of several matrices are slow
+        forces = model.stiffness.reshape(-1, model.n_basis) @ self.amplitude
+        forces += model.coupling.reshape(-1, len(given)) @ given
+        return np.asarray((self.system.moduli[:, None] * forces.reshape(model.n_regions, -1)).T)
 
 
 @dataclass(frozen=True, slots=True)
