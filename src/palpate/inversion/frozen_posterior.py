@@ -228,7 +228,7 @@ class FrozenPosterior:
         for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
             there, own = state.reduced.solve(moduli, coefficients), parameters.unknowns_of(s)
             z = state.coordinates(there.amplitude, moduli, coefficients, parameters.offsets(unknowns, s))
-            amplitude_slopes, force = parameters.by_unknowns(there.amplitude_tangent(), unknowns), state.form @ z
+            amplitude_slopes, force = there.amplitude_tangent(modulus_slopes), state.form @ z
             value += 0.5 * float(z @ force)
             misfit += float(z @ (state.square @ z))
             score[own] += state.gradient(force, amplitude_slopes, modulus_slopes)

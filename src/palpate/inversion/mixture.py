@@ -6,8 +6,9 @@ posterior is nearly normal. The probability of an explanation is its evidence, b
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from palpate.inversion.objective import Evaluation
 from palpate.inversion.optimise import Bounds, Minimum, gauss_newton, same_minimum
 from palpate.inversion.scenarios import Alternatives, alternatives_of, scenarios_of
 from palpate.parallel import mapped
-from palpate.unknowns.arrowhead import Arrowhead, forward
+from palpate.unknowns.arrowhead import Arrowhead, backward, forward, lower_factor
 from palpate.unknowns.blocks import Alternative
 from palpate.unknowns.parameters import ParameterMap
 
@@ -203,10 +204,7 @@ class _Eliminated:
         """The unknowns `own` (n_own,) at their best beside shared ones (n_shared,)."""
         found = np.append(of_shared, -1.0)
         for step in reversed(self.steps):
-            half = -step.border @ found
-            found = np.concatenate(
-                [linalg.solve_triangular(step.factor, half, lower=True, trans="T", check_finite=False), found]
-            )
+            found = np.concatenate([backward(step.factor, -step.border @ found), found])
         return found[: len(self.own)]
 
 
@@ -227,7 +225,7 @@ class _Step:
     def of(cls, matrix: NDArray[np.float64], prior: Alternative) -> _Step:
         """The first m unknowns of a matrix (m + n + 1, m + n + 1) under their prior."""
         m = len(prior.covariance)
-        factor = linalg.cholesky(matrix[:m, :m] + prior.precision, lower=True, check_finite=False)
+        factor = lower_factor(matrix[:m, :m] + prior.precision)
         border = forward(factor, matrix[:m, m:])
         determinant = prior.log_determinant - 2.0 * float(np.log(np.diag(factor)).sum())
         return cls(factor, border, matrix[m:, m:] - border.T @ border, determinant)
@@ -240,6 +238,13 @@ def _likeliest_together(gains: Sequence[Mapping[int, float]], most: int) -> dict
         longer = [((*numbers, i), level + gain) for numbers, level in found for i, gain in of.items()]
         found = sorted((each for each in longer if each[1] > -SEEN), key=lambda each: -each[1])[:most]
     return dict(found)
+
+
+def _log_evidence(matrix: NDArray[np.float64], pull: NDArray[np.float64]) -> float:
+    """1/2 (b^T A^-1 b - ln det A) of a positive definite matrix A (n, n) and a pull b (n,)."""
+    factor = lower_factor(matrix)
+    target = forward(factor, pull)
+    return 0.5 * float(target @ target) - float(np.log(np.diag(factor)).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,38 +310,38 @@ class LinearEvidence:
         Of several images the alternatives of each are chosen in turn, beside those of the others. Which combinations
         are likely is then told by what each of an image's alternatives loses alone.
         """
-        found, fewest = list[_Compared](), max(most // max(len(self.images), 1), FEWEST)
+        found, fewest = list[tuple[float, Callable[[], _Compared]]](), max(most // max(len(self.images), 1), FEWEST)
         for scenario in scenarios_of(self.parameters.blocks):
             found += self._of_scenario(scenario, most)
-        best = max(of.evidence for of in found)
-        found = sorted((of for of in found if of.evidence > best - SEEN), key=lambda of: -of.evidence)
-        return found[:fewest]
+        best = max(evidence for evidence, _ in found)
+        found = sorted((each for each in found if each[0] > best - SEEN), key=lambda each: -each[0])
+        return [minimum() for _, minimum in found[:fewest]]
 
-    def _of_scenario(self, scenario: Alternatives, most: int) -> list[_Compared]:
-        """Its likeliest explanation, and those that are seen beside it, `most` at most."""
+    def _of_scenario(self, scenario: Alternatives, most: int) -> list[tuple[float, Callable[[], _Compared]]]:
+        """Its likeliest explanation, and those seen beside it, `most` at most: evidence, and what finds the minimum."""
         parameters, shared = self.parameters.choosing(dict(scenario.chosen)), self.shared
         prior, centre = parameters.prior_matrix.block(shared, shared), parameters.prior_centre[shared]
         n = parameters.n_parameters
         own = 0.5 * (log_det(Arrowhead.of(prior[n:, n:])) - float(centre @ prior @ centre)) + scenario.log_odds
         information, pull = self.information + prior, self.pull + prior @ centre
 
-        def evidence(numbers: Sequence[int]) -> float:
-            """The log-evidence of alternatives by their number in each image."""
-            parts = [image[k][1] for image, k in zip(self.images, numbers, strict=True)]
-            factor = linalg.cholesky(information - sum(part.taken for part in parts), lower=True, check_finite=False)
-            target = linalg.solve_triangular(
-                factor, pull - sum(part.pull for part in parts), lower=True, check_finite=False
-            )
-            level = 0.5 * float(target @ target) - float(np.log(np.diag(factor)).sum())
-            return level + own + sum(part.level for part in parts)
+        def evidence(numbers: Sequence[int], k: int | None = None) -> list[float]:
+            """The log-evidence of alternatives by their number in each image, of all those of image k in its place."""
+            parts = [image[i][1] for j, (image, i) in enumerate(zip(self.images, numbers, strict=True)) if j != k]
+            matrix, right = information - sum(part.taken for part in parts), pull - sum(part.pull for part in parts)
+            level = own + sum(part.level for part in parts)
+            if k is None:
+                return [level + _log_evidence(matrix, right)]
+            each = [part for _, part in self.images[k]]
+            return [level + part.level + _log_evidence(matrix - part.taken, right - part.pull) for part in each]
 
         def others(numbers: tuple[int, ...], k: int) -> dict[tuple[int, ...], float]:
             """All explanations that differ from one in image k alone, and itself."""
             every = [(*numbers[:k], i, *numbers[k + 1 :]) for i in range(len(self.images[k]))]
-            return {each: evidence(each) for each in every}
+            return dict(zip(every, evidence(numbers, k), strict=True))
 
         numbers = tuple(max(range(len(image)), key=lambda i: image[i][1].level) for image in self.images)
-        by_image = [others(numbers, k) for k in range(len(self.images))]
+        by_image = [dict[tuple[int, ...], float]() for _ in self.images]
         for _ in range(ROUNDS if len(self.images) > 1 else 1):
             before = numbers
             for k in range(len(self.images)):
@@ -344,16 +349,20 @@ class LinearEvidence:
                 numbers = max(by_image[k], key=lambda each: by_image[k][each])
             if numbers == before:
                 break
-        by_image = [others(numbers, k) for k in range(len(self.images))] if len(self.images) > 1 else by_image
-        best = max(level for of in by_image for level in of.values()) if by_image else evidence(())
+        else:  # the first images' are of other alternatives of the last ones
+            by_image = [others(numbers, k) for k in range(len(self.images))] if len(self.images) > 1 else by_image
+        best = max(level for of in by_image for level in of.values()) if by_image else evidence(())[0]
         gains = [{each[k]: level - best for each, level in of.items()} for k, of in enumerate(by_image)]
         together = _likeliest_together(gains, most)
         every = [float(np.log(np.sum(np.exp(list(of.values()))))) for of in gains]
         several = sum(every) - float(np.log(np.sum(np.exp(list(together.values())))))
-        levels = {each: evidence(each) for each in together}
+        levels = {each: evidence(each)[0] for each in together}
         best = max(levels.values())
         seen = [(each, level) for each, level in levels.items() if level > best - SEEN]
-        return [self._compared(scenario, each, level + several, several, prior, pull) for each, level in seen]
+        return [
+            (level + several, partial(self._compared, scenario, each, level + several, several, prior, pull))
+            for each, level in seen
+        ]
 
     def _compared(
         self,

@@ -113,10 +113,10 @@ class ReducedModel:
         """The factorised reduced system at moduli (n_regions,) kPa; raises `SolverError`."""
         checked = checked_moduli(moduli, self.names)
         try:
-            factor = linalg.cho_factor(np.tensordot(checked, self.stiffness, axes=1), lower=True, check_finite=False)
+            factor = linalg.cho_factor(_weighted(checked, self.stiffness), lower=True, check_finite=False)
         except linalg.LinAlgError as error:
             raise self._indefinite(checked) from error
-        forces = np.tensordot(checked, self.coupling, axes=1)
+        forces = _weighted(checked, self.coupling)
         forces[:, -1] -= self.load
         amplitudes = -linalg.cho_solve(factor, forces, check_finite=False)
         return ReducedSystem(self, checked, factor[0], amplitudes)
@@ -147,6 +147,11 @@ class ReducedModel:
             f"the reduced stiffness of {self.n_basis} basis vectors is not positive definite: the moduli"
             f" {moduli.tolist()} kPa differ too much, or the basis holds nearly equal displacements"
         )
+
+
+def _weighted(weights: NDArray[np.float64], matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum (m, k) of matrices (n, m, k), each times its weight (n,)."""
+    return np.asarray((weights @ matrices.reshape(len(weights), -1)).reshape(matrices.shape[1:]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,9 +196,13 @@ class ReducedEquilibrium(DenseEquilibrium):
     amplitude: NDArray[np.float64]
     values: NDArray[np.float64]
 
-    def amplitude_tangent(self) -> NDArray[np.float64]:
-        """Derivatives (m, n_regions + n_boundary) of the basis coefficients by ln E, then by the boundary modes."""
-        by_modulus = self.system.backward(-self._modulus_forces())
+    def amplitude_tangent(self, slopes: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """Derivatives (m, k + n_boundary) of the basis coefficients by what moves the moduli, then by boundary modes.
+
+        slopes (n_regions, k): of ln E by the former; None: ln E itself.
+        """
+        forces = -self._modulus_forces()
+        by_modulus = self.system.backward(forces if slopes is None else forces @ slopes)
         return np.concatenate([by_modulus, self.system.amplitudes[:, :-1]], axis=1)
 
     def tangent(self) -> NDArray[np.float64]:

@@ -200,7 +200,7 @@ class Arrowhead:
         """With each image's own unknowns eliminated; raises `LinAlgError` where one of D_k is not positive definite."""
         factors, borders, left = list[NDArray[np.float64]](), list[NDArray[np.float64]](), self.shared
         for own, across in zip(self.own, self.across, strict=True):
-            factors.append(linalg.cholesky(own, lower=True, check_finite=False))
+            factors.append(lower_factor(own))
             borders.append(forward(factors[-1], across))
             left = left - borders[-1].T @ borders[-1]
         return Eliminated(self.places, tuple(factors), tuple(borders), left)
@@ -231,13 +231,13 @@ class Arrowhead:
         at = np.searchsorted(others.shared, self.places.shared)
         for k, (of_image, own, across) in enumerate(self._images()):
             if k not in near:
-                factor = linalg.cholesky(own, lower=True, check_finite=False)
+                factor = lower_factor(own)
                 border = forward(factor, across)
                 matrix[np.ix_(at, at)] -= border.T @ border
                 right[at] -= border.T @ forward(factor, rhs[of_image])
         which = np.searchsorted(others.shared, numbers)
         rest = np.setdiff1d(np.arange(len(right)), which)
-        factor = linalg.cholesky(matrix[np.ix_(rest, rest)], lower=True, check_finite=False)
+        factor = lower_factor(matrix[np.ix_(rest, rest)])
         border, half = forward(factor, matrix[np.ix_(rest, which)]), forward(factor, right[rest])
         return matrix[np.ix_(which, which)] - border.T @ border, right[which] - border.T @ half
 
@@ -273,9 +273,7 @@ class Eliminated:
         found = np.empty((self.places.size, *of_shared.shape[1:]))
         found[self.places.shared] = of_shared
         for own, factor, border, half in zip(self.places.images, self.factors, self.borders, halves, strict=True):
-            found[own] = linalg.solve_triangular(
-                factor, half - border @ of_shared, lower=True, trans="T", check_finite=False
-            )
+            found[own] = backward(factor, half - border @ of_shared)
         return found
 
     def inverse_among(self, numbers: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -293,9 +291,27 @@ class Eliminated:
         return np.asarray(found + by_shared @ np.linalg.inv(self.left) @ by_shared.T)
 
 
+def lower_factor(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """L (n, n), lower, of a symmetric A = L L^T (n, n); raises `LinAlgError` where A is not positive definite.
+
+    LAPACK is called as it is, here and below: of small matrices what SciPy checks first takes most of the time.
+    """
+    if not len(matrix):
+        return matrix
+    factor, failed = linalg.lapack.dpotrf(matrix.T, lower=1, clean=1)  # its own transpose is taken without a copy
+    if failed:
+        raise np.linalg.LinAlgError(f"the leading {failed} of {len(matrix)} unknowns are not determined")
+    return np.asarray(factor)
+
+
 def forward(factor: NDArray[np.float64], rhs: NDArray[np.float64]) -> NDArray[np.float64]:
     """L^-1 b (n,) or (n, k) of a lower factor L (n, n) and b (n,) or (n, k)."""
-    return np.asarray(linalg.solve_triangular(factor, rhs, lower=True, check_finite=False))
+    return np.asarray(linalg.lapack.dtrtrs(factor, rhs, lower=1)[0]) if rhs.size else rhs
+
+
+def backward(factor: NDArray[np.float64], rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """L^-T b (n,) or (n, k) of a lower factor L (n, n) and b (n,) or (n, k)."""
+    return np.asarray(linalg.lapack.dtrtrs(factor, rhs, lower=1, trans=1)[0]) if rhs.size else rhs
 
 
 def _plus_diagonal(matrix: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
