@@ -19,7 +19,7 @@ from palpate.inversion.optimise import LeastSquares
 from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
-from palpate.mechanics.reduced import ReducedModel
+from palpate.mechanics.reduced import ReducedModel, common_vectors
 from palpate.unknowns.parameters import ParameterMap
 
 ONE = np.ones(1)  # the coordinate of what no unknown moves
@@ -110,13 +110,14 @@ class FrozenState:
 
     Offsets of the residuals stand before the 1. expanded (n_regions,) kPa: E_0 where an expansion adds to the model, z
     = [a, q, ln E - ln E_0, 1]; form: Q (k, k), the residuals' part of the objective is 1/2 z^T Q z; square: S (k, k),
-    their mean square is z^T S z, mm^2.
+    their mean square is z^T S z, mm^2; common: how many first basis vectors are those of the first state.
     """
 
     reduced: ReducedModel
     expanded: NDArray[np.float64] | None
     form: NDArray[np.float64]
     square: NDArray[np.float64]
+    common: int = 0
 
     def coordinates(
         self,
@@ -224,9 +225,10 @@ class FrozenPosterior:
         moduli, away = parameters.moduli(unknowns), unknowns - parameters.prior_centre
         pull, modulus_slopes = prior @ away, parameters.derivatives(unknowns)
         value, score, misfit = 0.5 * float(away @ pull), pull.copy(), 0.0
-        blocks = list[tuple[NDArray[np.int64], NDArray[np.float64]]]()
+        blocks, first = list[tuple[NDArray[np.int64], NDArray[np.float64]]](), None
         for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
-            there, own = state.reduced.solve(moduli, coefficients), parameters.unknowns_of(s)
+            system = state.reduced.system(moduli, first, state.common)
+            first, there, own = first or system, system.solve(coefficients), parameters.unknowns_of(s)
             z = state.coordinates(there.amplitude, moduli, coefficients, parameters.offsets(unknowns, s))
             amplitude_slopes, force = there.amplitude_tangent(modulus_slopes), state.form @ z
             value += 0.5 * float(z @ force)
@@ -247,7 +249,7 @@ def frozen_posterior(
     evaluation = evaluation or objective(unknowns)
     parameters = objective.parameters
     moduli, coefficients = parameters.moduli(unknowns), parameters.coefficients(unknowns)
-    states = []
+    states = list[FrozenState]()
     for s, model in enumerate(fixed_correspondence(objective, unknowns, evaluation).models):
         reduced = model.like if isinstance(model, CurvedModel) else model
         if not isinstance(reduced, ReducedModel):
@@ -284,7 +286,8 @@ def frozen_posterior(
             own = np.block([[by_z.gram(term.weights), side], [side.T, float(term.weights @ rest**2)]])
             form += term.precision * own
             square += own / len(evaluation.linearisations)
-        states.append(replace(bare, form=form, square=square))
+        common = common_vectors(states[0].reduced, bare.reduced) if states else 0
+        states.append(replace(bare, form=form, square=square, common=common))
     return FrozenPosterior(parameters, tuple(states))
 
 

@@ -20,8 +20,9 @@ from palpate.inversion.frozen_posterior import Posterior
 from palpate.inversion.objective import Evaluation
 from palpate.inversion.optimise import Bounds, Minimum, gauss_newton, same_minimum
 from palpate.inversion.scenarios import Alternatives, alternatives_of, scenarios_of
+from palpate.mechanics.solvers.cholesky import backward, forward, lower_factor
 from palpate.parallel import mapped
-from palpate.unknowns.arrowhead import Arrowhead, backward, forward, lower_factor
+from palpate.unknowns.arrowhead import Arrowhead
 from palpate.unknowns.blocks import Alternative
 from palpate.unknowns.parameters import ParameterMap
 

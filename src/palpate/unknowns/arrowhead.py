@@ -13,7 +13,8 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+
+from palpate.mechanics.solvers.cholesky import backward, forward, lower_factor
 
 SHARED = -1  # in the place of an image's number
 
@@ -289,29 +290,6 @@ class Eliminated:
             by_shared[which] = -root.T @ self.borders[k]
             found[np.ix_(which, which)] = root.T @ root
         return np.asarray(found + by_shared @ np.linalg.inv(self.left) @ by_shared.T)
-
-
-def lower_factor(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """L (n, n), lower, of a symmetric A = L L^T (n, n); raises `LinAlgError` where A is not positive definite.
-
-    LAPACK is called as it is, here and below: of small matrices what SciPy checks first takes most of the time.
-    """
-    if not len(matrix):
-        return matrix
-    factor, failed = linalg.lapack.dpotrf(matrix.T, lower=1, clean=1)  # its own transpose is taken without a copy
-    if failed:
-        raise np.linalg.LinAlgError(f"the leading {failed} of {len(matrix)} unknowns are not determined")
-    return np.asarray(factor)
-
-
-def forward(factor: NDArray[np.float64], rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """L^-1 b (n,) or (n, k) of a lower factor L (n, n) and b (n,) or (n, k)."""
-    return np.asarray(linalg.lapack.dtrtrs(factor, rhs, lower=1)[0]) if rhs.size else rhs
-
-
-def backward(factor: NDArray[np.float64], rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """L^-T b (n,) or (n, k) of a lower factor L (n, n) and b (n,) or (n, k)."""
-    return np.asarray(linalg.lapack.dtrtrs(factor, rhs, lower=1, trans=1)[0]) if rhs.size else rhs
 
 
 def _plus_diagonal(matrix: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
