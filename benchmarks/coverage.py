@@ -169,7 +169,7 @@ def _body(scene: Scene, row: Row, edge_mm: float) -> Body:
     if state.finite_strain is not None:
         finite = state.finite_strain.under(known.model.conditions)
         known = replace(known, finite_strain=replace(finite, material=known.model.material))
-    parameters = replace(linear.objective.parameters, nuisance_precision=np.zeros((0, 0)))  # to be learned anew
+    parameters = replace(linear.objective.parameters, priors=())  # to be learned anew
     truth = np.log(true_ratios(linear.objective, scene))
     return Body(
         scene,
@@ -281,7 +281,7 @@ def _limits(inversion: Inversion, row: Row) -> dict[str, list[float]]:
         "limit_widest": (*held, Choice.PATCHINESS, Choice.FRAME, Choice.DRAWING),
     }
     for name, choices in wide.items():
-        prior = evaluation.prior.copy()
+        prior = evaluation.prior.dense
         for i, block in enumerate(parameters.blocks):
             own = np.ix_(parameters.columns(i), parameters.columns(i))
             if block.choice in choices:

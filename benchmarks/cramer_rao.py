@@ -31,7 +31,7 @@ def cramer_rao(evaluation: Evaluation, noise: NoiseModel, n_parameters: int, *, 
     faces would tell moduli from the differences of neighbours, which are rounding that no such model describes: a limit
     that its own weights miss by far (benchmarks/noise_limit.py).
     """
-    inverse = np.linalg.inv(fisher_information(evaluation, noise, cell_mm=cell_mm) + evaluation.prior)
+    inverse = np.linalg.inv(fisher_information(evaluation, noise, cell_mm=cell_mm) + evaluation.prior.dense)
     return np.asarray(inverse[:n_parameters, :n_parameters])
 
 
@@ -49,7 +49,8 @@ def efficient_gain(
     noise of this model, G C G^T with the prior's part is the limit of `cramer_rao`.
     """
     states = _whitened_states(evaluation, noise, cell_mm)
-    inverse = np.linalg.inv(_information(evaluation, states) + _of_points(evaluation) + evaluation.prior)[:n_parameters]
+    information = _information(evaluation, states) + _of_points(evaluation)
+    inverse = np.linalg.inv(information + evaluation.prior.dense)[:n_parameters]
     found: list[NDArray[np.float64]] = []
     for state in states:
         rows = np.asarray(inverse[:, state.lines[0].columns] @ state.weighted.T @ state.means)
@@ -86,7 +87,7 @@ def _whitened_states(evaluation: Evaluation, noise: NoiseModel, cell_mm: float) 
 
 def _of_points(evaluation: Evaluation) -> NDArray[np.float64]:
     """J^T J / sd^2 (n, n) of all unknowns by the residuals of points, which have one standard deviation and no more."""
-    information = np.zeros_like(evaluation.prior)
+    information = np.zeros((evaluation.prior.size,) * 2)
     for line in evaluation.linearisations:
         if isinstance(line.observation, PointDisplacement):
             weights = np.full(len(line.weights), line.observation.stated.sd**-2.0)
@@ -96,7 +97,7 @@ def _of_points(evaluation: Evaluation) -> NDArray[np.float64]:
 
 def _information(evaluation: Evaluation, states: Sequence[_Whitened]) -> NDArray[np.float64]:
     """That of the surfaces (n, n), of all unknowns."""
-    information = np.zeros_like(evaluation.prior)
+    information = np.zeros((evaluation.prior.size,) * 2)
     for state in states:
         columns = state.lines[0].columns
         seen = np.asarray(state.means @ _jacobian(state.lines))

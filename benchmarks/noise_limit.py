@@ -111,7 +111,7 @@ def _row(
     n = len(names)
     jacobian = np.concatenate([line.jacobian.of_rows(model_to_image(line)).dense for line in evaluation.linearisations])
     by_modes = weights.rows @ jacobian[:, n:]  # modes that the weights do not keep out of the moduli
-    by_prior = by_modes @ np.linalg.solve(evaluation.prior[n:, n:], by_modes.T)
+    by_prior = by_modes @ np.linalg.solve(evaluation.prior.dense[n:, n:], by_modes.T)
     scatter = np.sqrt(np.diag(np.cov(shifts.T) + by_prior))
     promised = None if weights.promised is None else np.sqrt(np.diag(weights.promised)).tolist()
     return {"weights": weights.name, "tissues": list(names), "promised_sd": promised, "scatter_sd": scatter.tolist()}

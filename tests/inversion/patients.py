@@ -276,7 +276,7 @@ def patient(rng, n_images=1, *, bend=0.0, gain=(1.0, 1.0), **beliefs) -> Patient
 def without(of: Patient, dropped) -> Patient:
     """The same without what the blocks that are `dropped`, by their numbers, stand for."""
     parameters, kept = of.parameters, [i for i in range(len(of.parameters.blocks)) if i not in dropped]
-    fewer = replace(parameters, blocks=tuple(parameters.blocks[i] for i in kept), nuisance_precision=np.zeros((0, 0)))
+    fewer = replace(parameters, blocks=tuple(parameters.blocks[i] for i in kept), priors=())
     bodies = []
     for s, body in enumerate(of.bodies):
         groups = [parameters.acting(acts, s) for acts in (Acts.BOUNDARY, Acts.MATERIAL)]
@@ -304,7 +304,7 @@ def in_unit(of: Patient, unit) -> Patient:
         else block
         for block in own.blocks
     ]
-    parameters = replace(own, blocks=tuple(blocks), nuisance_precision=np.zeros((0, 0)))
+    parameters = replace(own, blocks=tuple(blocks), priors=())
     bodies = tuple(Response(unit * b.slopes, unit * b.bends, b.n_boundary) for b in of.bodies)
     truth = of.truth.copy()
     for s in range(own.n_states):
@@ -318,7 +318,7 @@ def reordered(problem: InverseProblem, order) -> InverseProblem:
     alone = {block.states: [b for b in own.blocks if b.states == block.states] for block in own.blocks}
     tissues = [block for block in own.blocks if len(block.states) > 1]
     images = [replace(block, states=(new,)) for new, old in enumerate(order) for block in alone[(old,)]]
-    parameters = replace(own, blocks=(*tissues, *images), nuisance_precision=np.zeros((0, 0)))
+    parameters = replace(own, blocks=(*tissues, *images), priors=())
     return InverseProblem(tuple(problem.states[old] for old in order), parameters)
 
 
@@ -345,7 +345,7 @@ def exact_posterior(of: Patient, seen):
     every, design, read = list(every_explanation(of.parameters)), of.design(), np.concatenate(seen)
     levels = np.array([odds + dense_evidence(of, seen, chosen) for chosen, odds in every])
     weights = np.exp(levels - levels.max()) / np.sum(np.exp(levels - levels.max()))
-    priors = (of.parameters.choosing(dict(chosen)).prior_matrix for chosen, _ in every)
+    priors = (of.parameters.choosing(dict(chosen)).prior_matrix.dense for chosen, _ in every)
     whole = [np.linalg.inv(design.T @ design / SD**2 + prior) for prior in priors]
     means = np.stack([(inverse @ design.T @ read / SD**2)[:2] for inverse in whole])
     away = means - weights @ means

@@ -25,6 +25,7 @@ from palpate.observation.target import surface_target
 from palpate.phantoms.shapes import ball
 from palpate.unknowns import (
     Acts,
+    Arrowhead,
     Block,
     ParameterMap,
     material_blocks,
@@ -86,9 +87,10 @@ def test_a_frame_is_believed_to_stand_still_to_hardly_move_or_to_move(motion, mo
     smooth, information = motion.modes[:, :n], motion.modes.T @ motion.modes / 0.1**2
     x = np.append(moved_mm / 1.5 * rng.normal(size=n), np.zeros(6))
     prior, nothing = mapping.prior_matrix, np.zeros(len(x))
-    evaluation = Evaluation(0.0, 0.0, -information @ x, information + prior, (), prior, nothing)
+    matrix = Arrowhead.of(information, mapping.places.images) + prior
+    evaluation = Evaluation(0.0, 0.0, -information @ x, matrix, (), prior, nothing)
     likeliest = LinearEvidence.of(mapping, evaluation, nothing).compared(40)[0]
-    believed = np.linalg.inv(mapping.choosing(dict(likeliest.chosen)).nuisance_precision)[:n, :n]
+    believed = np.linalg.inv(mapping.choosing(dict(likeliest.chosen)).prior_matrix.dense)[:n, :n]
     moves = smooth.any(axis=1)
     sd = np.sqrt(np.einsum("pm,mk,pk->p", smooth[moves], believed, smooth[moves]).mean())
     assert 0.98 * low < sd < 1.02 * high
@@ -139,9 +141,9 @@ def test_a_surface_that_is_drawn_larger_is_found_and_no_modulus_pays_for_it(twin
 def test_an_offset_is_believed_wide_where_a_search_begins_and_by_what_is_likelier_where_it_ends(twins, twin):
     """Held small at first, what is drawn otherwise is taken for motion. That of a driver is held all along."""
     problem = drawn_otherwise(twins, twin, lambda seen: [offset_block(o, 0, sd=0.5) for o in seen])
-    begins = 1.0 / np.sqrt(np.diag(problem.parameters.prior_matrix)[-3:])
+    begins = 1.0 / np.sqrt(problem.parameters.prior_matrix.diagonal[-3:])
     found = invert(problem, twins.settings(2.0), progress=twins.silent)
-    ends = 1.0 / np.sqrt(np.diag(found.objective.parameters.prior_matrix)[-3:])
+    ends = 1.0 / np.sqrt(found.objective.parameters.prior_matrix.diagonal[-3:])
     assert begins == pytest.approx([0.5, 0.5, 0.5e-4])
     assert ends == pytest.approx([0.5, 0.05, 0.5e-4])
     (image,) = found.mixture.explanations[0].images

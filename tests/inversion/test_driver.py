@@ -12,7 +12,7 @@ from scipy import linalg
 
 from palpate.inversion import LaterState, Objective, hyper_parameters
 from palpate.observation.wall_modes import Wall, fine_modes, wall_modes, wall_of
-from palpate.unknowns import Acts, Block, ParameterMap, unit_blocks, wall_blocks
+from palpate.unknowns import Acts, Alternative, Arrowhead, Block, ParameterMap, unit_blocks, wall_blocks
 from palpate.unknowns.blocks import only
 
 N_MODES = 90
@@ -50,10 +50,16 @@ def learned_precision(ball, motion, *, sd_mm, seen=None):
         modes, motion = np.einsum("pa,pam->pm", seen, rows), np.einsum("pa,pa->p", seen, motion)
     data = modes.T @ modes / sd_mm**2
     score = -modes.T @ motion.ravel() / sd_mm**2  # at no motion
-    prior = np.eye(len(data))
-    evaluation = SimpleNamespace(matrix=data + prior, prior=prior, score=score, prior_score=np.zeros(len(data)))
+    prior = arrow(len(data))
+    shown = Arrowhead.of(data, prior.places.images)
+    evaluation = SimpleNamespace(matrix=shown + prior, prior=prior, score=score, prior_score=np.zeros(len(data)))
     found = hyper_parameters.with_amplitudes(moved_by(ball.wall), evaluation, np.zeros(len(data)))
-    return found.parameters.nuisance_precision
+    return found.parameters.prior_matrix.dense
+
+
+def arrow(n, size=1.0):
+    """That many unknowns of one image, each with a precision of this size."""
+    return Arrowhead.of(size * np.eye(n), (np.arange(n),))
 
 
 def moved_by(*walls):
@@ -130,10 +136,11 @@ def test_what_is_learned_of_a_wall_does_not_hang_on_what_was_believed_of_it():
     data, score = modes.T @ modes / 0.1**2, -modes.T @ motion.ravel() / 0.1**2
     objective, found = moved_by(replace(here.wall, n_fine=fine.shape[1])), list[np.ndarray]()
     for sds in ((1.0, 0.01), (0.01, 1.0)):
-        prior = np.diag(np.repeat(sds, [n, fine.shape[1]]) ** -2.0)
-        seen = SimpleNamespace(matrix=data + prior, prior=prior, score=score, prior_score=np.zeros(len(data)))
+        prior = Arrowhead.of(np.diag(np.repeat(sds, [n, fine.shape[1]]) ** -2.0), (np.arange(len(data)),))
+        shown = Arrowhead.of(data, prior.places.images)
+        seen = SimpleNamespace(matrix=shown + prior, prior=prior, score=score, prior_score=np.zeros(len(data)))
         learned = hyper_parameters.with_amplitudes(objective, seen, np.zeros(len(data)))
-        found.append(np.diag(np.linalg.inv(learned.parameters.nuisance_precision)))
+        found.append(np.diag(learned.parameters.priors[0].covariance))
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
@@ -170,9 +177,9 @@ def test_where_nothing_is_seen_the_evidence_asks_for_nothing(n_terms, capfd):
     terms = tuple(np.diag([1.0, 2.0, 0.5]) ** (k + 1) for k in range(n_terms))
     block = Block("b", "driver", Acts.BOUNDARY, (0,), only(np.eye(3)), terms=terms)
     given = Objective((LaterState(None, ()),), ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, (block,)))
-    evaluation = SimpleNamespace(matrix=np.eye(3), prior=np.eye(3), score=np.zeros(3), prior_score=np.zeros(3))
+    evaluation = SimpleNamespace(matrix=arrow(3), prior=arrow(3), score=np.zeros(3), prior_score=np.zeros(3))
     found = hyper_parameters.with_amplitudes(given, evaluation, np.zeros(3))
-    believed = np.linalg.inv(found.parameters.nuisance_precision)
+    believed = found.parameters.priors[0].covariance
     assert believed == pytest.approx(sum(terms), abs=0.01)
     assert capfd.readouterr() == ("", "")
 
@@ -180,10 +187,10 @@ def test_where_nothing_is_seen_the_evidence_asks_for_nothing(n_terms, capfd):
 def test_walls_that_are_not_given_keep_the_modes_own_prior():
     own = unit_blocks(N_MODES)
     given = Objective((LaterState(None, ()),), ParameterMap(np.ones(1), np.zeros((1, 0)), (), "rest", True, own))
-    evaluation = SimpleNamespace(matrix=2.0 * np.eye(N_MODES), prior=np.eye(N_MODES))
+    evaluation = SimpleNamespace(matrix=arrow(N_MODES, 2.0), prior=arrow(N_MODES))
     evaluation.score = evaluation.prior_score = np.zeros(N_MODES)
     found = hyper_parameters.with_amplitudes(given, evaluation, np.zeros(N_MODES))
-    assert found.parameters.nuisance_precision == pytest.approx(np.eye(N_MODES))
+    assert found.parameters.prior_matrix.dense == pytest.approx(np.eye(N_MODES))
 
 
 def test_what_is_believed_of_the_others_follows_their_prior_mean_too(rng):
@@ -197,13 +204,13 @@ def test_what_is_believed_of_the_others_follows_their_prior_mean_too(rng):
         np.ones(2), np.eye(2), ("a", "b"), "c", True, (), prior_mean=mean, prior_precision=precision
     )
     block = Block("b", "driver", Acts.BOUNDARY, (0,), only(np.eye(k)), terms=(term,))
-    parameters = replace(parameters, blocks=(block,), nuisance_precision=np.eye(k))
-    prior, data = parameters.prior_matrix, design.T @ design
+    parameters = replace(parameters, blocks=(block,), priors=(Alternative(np.eye(k)),))
+    prior, data = parameters.prior_matrix, Arrowhead.of(design.T @ design, parameters.places.images)
     x = rng.normal(size=n)
     score = design.T @ (values + design @ x)
     evaluation = SimpleNamespace(matrix=data + prior, prior=prior, score=score, prior_score=np.zeros(n))
     objective = Objective((LaterState(None, ()),), parameters)
-    found = hyper_parameters.with_amplitudes(objective, evaluation, x).parameters.nuisance_precision
+    found = hyper_parameters.with_amplitudes(objective, evaluation, x).parameters.priors[0].precision
 
     def log_evidence(amplitude):
         """ln N(values; -design mean, 1 + design C design^T), all unknowns marginalised."""

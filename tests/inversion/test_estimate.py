@@ -185,7 +185,7 @@ def test_the_way_to_the_estimate_does_not_show(twins, voxels, of_voxels):
 def test_it_ends_where_the_objective_is_least(of_voxels):
     """Of one explanation: the score vanishes along every log-modulus, all other unknowns at their best."""
     there = of_voxels.objective(of_voxels.minimum.unknowns)
-    shift = np.linalg.solve(there.matrix, there.score)
+    shift = np.linalg.solve(there.matrix.dense, there.score)
     assert np.all(np.abs(shift[:2]) < 0.1 * posterior_sd(of_voxels.minimum, 2))
 
 

@@ -37,7 +37,7 @@ def total(objective, evaluation):
     sds = [o.weighting.sd for o in objective.observations if not o.of_driver]
     drivers = sum(worse_driver(o.weighting.sd, sds[0]) for o in objective.observations if o.of_driver)
     normalisers = sum(o.weighting.log_normaliser for o in objective.observations)
-    return evaluation.value + normalisers + 0.5 * float(np.linalg.slogdet(evaluation.matrix)[1]) + drivers
+    return evaluation.value + normalisers + 0.5 * float(evaluation.matrix.log_determinant()) + drivers
 
 
 def test_all_surfaces_begin_with_one_noise_model_and_count_by_their_area(twins, voxels):

@@ -119,7 +119,7 @@ def test_every_component_is_the_exact_posterior_of_its_explanation(patients, see
     of, objective = seen
     design, read = of.design(), np.concatenate(patients.seen_in(objective))
     for each in mixture_at(objective, place(of)).explanations[:4]:
-        prior = of.parameters.choosing(each.chosen).prior_matrix
+        prior = of.parameters.choosing(each.chosen).prior_matrix.dense
         whole = np.linalg.inv(design.T @ design / patients.SD**2 + prior)
         assert each.covariance == pytest.approx(whole[:2, :2], rel=1e-6)
         sd = np.sqrt(np.diag(whole[:2, :2]))
@@ -200,7 +200,7 @@ def test_a_block_that_is_held_stays_so_under_every_explanation(patients):
     of = patients.patient(rng)
     blocks = list(of.parameters.blocks)
     blocks[SAC] = replace(blocks[SAC], alternatives=blocks[SAC].alternatives[1:], choice=Choice.HELD)
-    parameters = replace(of.parameters, blocks=tuple(blocks), nuisance_precision=np.zeros((0, 0)))
+    parameters = replace(of.parameters, blocks=tuple(blocks), priors=())
     objective = replace(of, parameters=parameters).objective(rng)
     mixture = mixture_at(objective, place(of, theta=np.zeros(2)))
     assert all(SAC not in each.chosen for each in mixture.explanations)

@@ -9,6 +9,7 @@ import pytest
 
 from palpate.errors import SolverError
 from palpate.inversion.optimise import RADIUS, Bounds, Outcome, TrustRegion, gauss_newton, same_minimum
+from palpate.unknowns import Arrowhead
 
 WIDE = Bounds(np.full(2, -5.0), np.full(2, 5.0))
 
@@ -157,7 +158,7 @@ def test_a_direction_that_bends_twice_as_much_as_the_matrix_says_is_not_crossed_
         n_parameters = 2
 
         def __call__(self, unknowns):
-            return replace(objective(unknowns), matrix=matrix)
+            return replace(objective(unknowns), matrix=Arrowhead.of(matrix))
 
     found = gauss_newton(Bent(), np.full(5, 2.0), bounds=WIDE, tolerance=1e-9)
     assert found.outcome is Outcome.CONVERGED
@@ -175,7 +176,7 @@ def test_a_step_is_taken_whole_where_the_place_between_both_slopes_cannot_be_sol
             there = objective(unknowns)
             if there.value < 1e-9:
                 raise SolverError("the motion turns elements inside out")
-            return replace(there, matrix=there.matrix / 1.9)
+            return replace(there, matrix=Arrowhead.of(there.matrix.dense / 1.9))
 
     away = np.array([0.2, -0.3, 0.1, 0.4, -0.2])
     found = gauss_newton(Hollow(), objective.centre + away, bounds=WIDE, max_steps=2)

@@ -106,7 +106,7 @@ def test_images_of_one_body_have_the_same_combinations_of_a_motion_and_one_model
 
     def problem(choice, variance):
         blocks = [Block("wall", "driver", Acts.BOUNDARY, (s,), only(variance * np.eye(size)), choice) for s in range(2)]
-        return replace(one, parameters=replace(parameters, blocks=tuple(blocks), nuisance_precision=np.zeros((0, 0))))
+        return replace(one, parameters=replace(parameters, blocks=tuple(blocks), priors=()))
 
     start = informed_start(problem(Choice.FRAME, 1e-4), np.zeros(2), progress=twins.silent)
     first, second = start.objective.approximations

@@ -8,6 +8,7 @@ import numpy as np
 
 from palpate.errors import SolverError
 from palpate.inversion.objective import Evaluation
+from palpate.unknowns import Arrowhead
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,8 @@ class Quadratic:
     def __call__(self, unknowns):
         slope = self.curvature @ (unknowns - self.centre)
         value = self.value(unknowns)
-        return Evaluation(value, value, self.pull * slope, self.curvature.copy(), (), 0.0 * self.curvature, 0.0 * slope)
+        matrix = Arrowhead.of(self.curvature)
+        return Evaluation(value, value, self.pull * slope, matrix, (), Arrowhead.zeros(matrix.places), 0.0 * slope)
 
 
 @dataclass(frozen=True)
@@ -82,9 +84,9 @@ class Saturating:
     def __call__(self, unknowns):
         slope = np.exp(unknowns)
         score = slope * (slope - np.exp(self.truth))
-        matrix = np.diag(slope**2)
+        matrix = Arrowhead.of(np.diag(slope**2))
         value = self.value(unknowns)
-        return Evaluation(value, value, score, matrix, (), 0.0 * matrix, 0.0 * score)
+        return Evaluation(value, value, score, matrix, (), Arrowhead.zeros(matrix.places), 0.0 * score)
 
 
 def coupled(rng, n=5, centre=None):

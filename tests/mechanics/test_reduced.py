@@ -11,7 +11,7 @@ from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics import reduced
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
-from palpate.mechanics.reduced import free_combinations, orthonormal_basis, projection
+from palpate.mechanics.reduced import common_vectors, free_combinations, orthonormal_basis, projection
 from palpate.mesh.space import lagrange_space
 
 RATIOS = (0.2, 1.0, 5.0, 25.0)
@@ -160,6 +160,22 @@ def test_a_projection_serves_another_state_of_the_body_on_the_same_vectors(model
     assert there.reduced.output_basis[0] is first.reduced.output_basis[0]
     assert there.reduced.solve(moduli, q).values == pytest.approx(anew.reduced.solve(moduli, q).values, abs=1e-9)
     assert first.under(model.under(model.conditions)).reduced is first.reduced
+
+
+def test_states_of_a_body_with_vectors_of_their_own_share_what_is_common_of_the_factor(model):
+    vectors, moduli, q = basis(model), np.array([1.0, 5.0]), np.array([1.0, -2.0])
+    constraint = replace(model.constraint, offset=-0.3 * model.constraint.offset)
+    other = model.under(replace(model.conditions, constraint=constraint))
+    first = projection(model, vectors[:, :6])
+    bent = first.under(other).extended(vectors[:, 9:11]).reduced
+    first = first.extended(vectors[:, 6:9]).reduced
+    assert common_vectors(first, bent) == 6
+    assert common_vectors(first, first) == first.n_basis
+    assert common_vectors(first, replace(bent, stiffness=2.0 * bent.stiffness)) == 0
+    shared, alone = bent.system(moduli, first.system(moduli), 6), bent.system(moduli)
+    assert shared.factor == pytest.approx(alone.factor, rel=1e-9, abs=1e-12 * np.abs(alone.factor).max())
+    assert shared.solve(q).values == pytest.approx(alone.solve(q).values, rel=1e-9, abs=1e-12)
+    assert shared.solve(q).tangent() == pytest.approx(alone.solve(q).tangent(), rel=1e-9, abs=1e-12)
 
 
 def test_what_is_there_already_extends_nothing(model):

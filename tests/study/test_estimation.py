@@ -305,7 +305,7 @@ def with_range(twins, twin, settings, *, sd):
     tissues = tuple(replace(t, modulus_sd=sd * (t.role is Role.KNOWN)) for t in twin.scene.tissues)
     problem = twins.exact_problem(twin, noise=NOISE)
     blocks = (*problem.parameters.blocks, *known_modulus_blocks(tissues, twin.model.regions, (0,)))
-    mapping = replace(problem.parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0)))
+    mapping = replace(problem.parameters, blocks=blocks, priors=())
     return invert(replace(problem, parameters=mapping), settings, progress=twins.silent)
 
 

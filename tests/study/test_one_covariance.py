@@ -43,7 +43,7 @@ def concluded(twins, bodies, observed, *, layers, samples):
         known = tuple(i for i, number in enumerate(regions) if tissues[number].role is Role.KNOWN)
         own = layer_blocks((("gland", known, 1.0),), (0, 1), sd=SD, thickness_mm=1.0)
         blocks = (*problem.parameters.blocks, *own)
-        mapping = replace(problem.parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0)))
+        mapping = replace(problem.parameters, blocks=blocks, priors=())
         problem = replace(problem, parameters=mapping)
     inversion = invert(problem, settings, progress=twins.silent)
     return conclude(inversion, settings, observed, truth={}, seed=1, samples=samples)

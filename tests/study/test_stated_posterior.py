@@ -34,7 +34,7 @@ def poor(inversion, twin):
 
 
 def posterior_of(objective, minimum):
-    covariance = np.linalg.inv(minimum.evaluation.matrix)[:2, :2]
+    covariance = np.linalg.inv(minimum.evaluation.matrix.dense)[:2, :2]
     zero = np.zeros_like(covariance)
     alone = np.ones(1), minimum.unknowns[None, :2], covariance[None]
     mixture = StatedMixture(*alone, Covariance(covariance, zero, zero, zero))

@@ -10,6 +10,7 @@ import pytest
 
 from palpate.inversion import Bounds, Evaluation, gauss_newton
 from palpate.uncertainty.combinations import information, known_pairs
+from palpate.unknowns import Arrowhead
 
 THETA = np.log([6.0, 3.0])
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
@@ -32,9 +33,9 @@ class Toy:
     n_parameters: int = 2
 
     def __call__(self, theta):
-        r, slopes, none = self.residuals(theta), self.derivatives(theta), np.zeros((2, 2))
-        pull = slopes.T @ r
-        return Evaluation(0.5 * float(r @ r), 0.0, pull, slopes.T @ slopes, (), none, np.zeros(2))
+        r, slopes = self.residuals(theta), self.derivatives(theta)
+        pull, matrix = slopes.T @ r, Arrowhead.of(slopes.T @ slopes)
+        return Evaluation(0.5 * float(r @ r), 0.0, pull, matrix, (), Arrowhead.zeros(matrix.places), np.zeros(2))
 
 
 def parabola(covariance):

@@ -26,7 +26,7 @@ from palpate.uncertainty.covariance import (
     scatter,
 )
 from palpate.uncertainty.intervals import log_interval
-from palpate.unknowns import ParameterMap, unit_blocks
+from palpate.unknowns import Arrowhead, ParameterMap, unit_blocks
 
 SD = 0.3
 
@@ -91,7 +91,7 @@ def observed(*lines, n_parameters=2, rests=(0, 1)):
         LaterState(None, tuple(line.observation for line in lines if line.state == s), reference=rests[s])
         for s in numbers
     ]
-    evaluation = Evaluation(0.0, 0.0, np.zeros(n), matrix, tuple(lines), prior, np.zeros(n))
+    evaluation = Evaluation(0.0, 0.0, np.zeros(n), Arrowhead.of(matrix), tuple(lines), Arrowhead.of(prior), np.zeros(n))
     return Objective(tuple(states), parameters), evaluation
 
 
@@ -114,13 +114,13 @@ def test_independent_residuals_give_the_usual_formula(rng):
     jacobian = rng.standard_normal((len(places), 4))
     line = surface(places, normals, jacobian, precision=len(places) / SD**2, noise=noise_of(0.5))
     objective, now = observed(line)
-    assert sandwich_covariance(objective, now) == pytest.approx(np.linalg.inv(now.matrix)[:2, :2], rel=1e-9)
+    assert sandwich_covariance(objective, now) == pytest.approx(np.linalg.inv(now.matrix.dense)[:2, :2], rel=1e-9)
 
 
 def test_the_gain_moves_the_estimate_as_a_normal_equation_does(smooth, rng):
     _, now = observed(surface(*smooth, precision=50.0, noise=noise_of(5.0)))
     errors = rng.standard_normal(len(smooth[0]))
-    expected = np.linalg.solve(now.matrix, 50.0 / len(errors) * smooth[2].T @ errors)[:2]
+    expected = np.linalg.solve(now.matrix.dense, 50.0 / len(errors) * smooth[2].T @ errors)[:2]
     assert gain(now, 2)[0] @ errors == pytest.approx(expected, rel=1e-9)
 
 
@@ -134,7 +134,7 @@ def test_the_interval_covers_the_truth_of_repeated_experiments(smooth, rng):
         error = np.einsum("na,na->n", motion.at(places), normals)
         prior = np.concatenate([np.zeros(2), rng.standard_normal(3)])
         score = prior - 200.0 / len(places) * jacobian.T @ error
-        draws.append(-np.linalg.solve(now.matrix, score)[:2])
+        draws.append(-np.linalg.solve(now.matrix.dense, score)[:2])
     spread = np.cov(np.transpose(draws))
     assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(spread)), rel=0.12)
     inside = np.abs(draws) < 1.96 * np.sqrt(np.diag(covariance))
@@ -163,7 +163,7 @@ def test_the_noise_of_errors_is_sought_by_what_the_fit_leaves_of_them(smooth, rn
             line.jacobian.transposed_times(line.precision * line.weights * error)
             for line, error in zip((driver, telling), halves, strict=True)
         )
-        taken = telling.jacobian.times(np.linalg.solve(now.matrix, score))
+        taken = telling.jacobian.times(np.linalg.solve(now.matrix.dense, score))
         moved = sum(gain.transposed_times(error) for gain, error in zip(response.gains, halves, strict=True))
         assert response.jacobians[0].times(moved) == pytest.approx(taken), state
 
@@ -209,8 +209,8 @@ def test_each_kind_of_observation_has_the_noise_of_its_kind_and_errs_on_its_own(
     def covariance(*seen):
         lines = [surface(*smooth, precision=200.0, noise=noise, kind=kind) for kind, noise in seen]
         objective, now = observed(*lines)
-        rest = np.linalg.solve(now.matrix, np.eye(5)[:, :2])
-        return sandwich_covariance(objective, now) - rest.T @ now.prior @ rest
+        rest = np.linalg.solve(now.matrix.dense, np.eye(5)[:, :2])
+        return sandwich_covariance(objective, now) - rest.T @ now.prior.dense @ rest
 
     both = covariance(("surface distance", rough), ("point", fine))
     alike = covariance(("surface distance", fine), ("surface distance", fine))

@@ -22,7 +22,7 @@ from palpate.observation.robust_loss import PowerLaw
 from palpate.observation.surface_distance import SurfaceDistance
 from palpate.phantoms.motion import smooth_field
 from palpate.uncertainty import sandwich_covariance
-from palpate.unknowns import ParameterMap, unit_blocks
+from palpate.unknowns import Arrowhead, ParameterMap, unit_blocks
 from palpate_validation.structured_meshes import box_mesh
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "cramer_rao.py"
@@ -59,7 +59,7 @@ def seen(jacobian):
     line = Linearisation(surface, 0, residuals, np.arange(5), Jacobian.of(jacobian), weights, None, None)
     prior = np.diag([0.0, 0.0, 1.0, 1.0, 1.0])
     matrix = prior + PRECISION * jacobian.T @ (weights[:, None] * jacobian)
-    evaluation = Evaluation(0.0, 0.0, np.zeros(5), matrix, (line,), prior, np.zeros(5))
+    evaluation = Evaluation(0.0, 0.0, np.zeros(5), Arrowhead.of(matrix), (line,), Arrowhead.of(prior), np.zeros(5))
     parameters = ParameterMap(np.ones(2), np.eye(2), ("a", "b"), "c", True, unit_blocks(3))
     return Objective((LaterState(None, (surface,)),), parameters), evaluation
 
@@ -90,7 +90,7 @@ def test_the_weights_of_the_limit_attain_it_under_noise_of_its_model(limits, smo
     assert kept[:, :2] == pytest.approx(np.zeros((2, 2)), abs=1e-9)  # no bias in the log-moduli
     fields = (smooth_field(rng, sd_mm=NOISE.sd, correlation_mm=5.0, features=100) for _ in range(400))
     draws = [rows @ np.einsum("na,na->n", field.at(places), normals) for field in fields]
-    found = np.cov(np.transpose(draws)) + kept[:, 2:] @ np.linalg.solve(now.prior[2:, 2:], kept[:, 2:].T)
+    found = np.cov(np.transpose(draws)) + kept[:, 2:] @ np.linalg.solve(now.prior.dense[2:, 2:], kept[:, 2:].T)
     limit = limits.cramer_rao(now, NOISE, 2, cell_mm=5.0)
     assert np.sqrt(np.diag(found)) == pytest.approx(np.sqrt(np.diag(limit)), rel=0.12)
 

@@ -45,8 +45,16 @@ def test_the_frozen_posterior_has_the_value_and_score_of_the_objective_where_it_
 def test_in_the_driver_the_frozen_posterior_is_the_quadratic_of_gauss_newton(objective, minimum, rng):
     frozen, evaluation = frozen_posterior(objective, minimum), objective(minimum)
     step = np.concatenate([np.zeros(2), 0.1 * rng.standard_normal(len(minimum) - 2)])
-    expected = evaluation.value + evaluation.score @ step + 0.5 * step @ evaluation.matrix @ step
+    expected = evaluation.value + evaluation.score @ step + 0.5 * step @ (evaluation.matrix @ step)
     assert frozen(minimum + step).value == pytest.approx(expected, rel=1e-9)
+
+
+def test_score_and_matrix_of_the_frozen_posterior_are_those_of_all_residuals_far_away(objective, minimum, rng):
+    evaluation, away = objective(minimum), minimum + 0.3 * rng.standard_normal(len(minimum))
+    frozen = frozen_posterior(objective, minimum, evaluation)(away)
+    fixed = fixed_correspondence(objective, minimum, evaluation)(away)
+    assert frozen.score == pytest.approx(fixed.score, rel=1e-8, abs=1e-8 * np.abs(fixed.score).max())
+    assert frozen.matrix.dense == pytest.approx(fixed.matrix.dense, rel=1e-8, abs=1e-8 * fixed.matrix.diagonal.max())
 
 
 def test_a_full_model_is_refused(objective, minimum, twin):
@@ -72,3 +80,5 @@ def test_an_expansion_that_bends_is_frozen_with_its_own_value_far_away(twins, rn
     away = unknowns + 0.5 * rng.standard_normal(len(unknowns))
     assert frozen(away).value == pytest.approx(fixed(away).value, rel=1e-9)
     assert frozen(unknowns).value == pytest.approx(fixed(unknowns).value, rel=1e-9)
+    assert frozen(away).score == pytest.approx(fixed(away).score, rel=1e-8, abs=1e-8)
+    assert frozen(away).matrix.dense == pytest.approx(fixed(away).matrix.dense, rel=1e-8, abs=1e-8)

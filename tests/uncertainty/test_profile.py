@@ -63,7 +63,7 @@ def marginals(fixed, minimum, variance, number):
             start = np.concatenate([[first, second], minimum.unknowns[n:]])
             there = Bounds(start[:n], start[:n])
             best = gauss_newton(fixed, start, bounds=there, tolerance=1e-6).evaluation
-            density[i, j] = -best.value - 0.5 * np.linalg.slogdet(best.matrix[n:, n:])[1]
+            density[i, j] = -best.value - 0.5 * np.linalg.slogdet(best.matrix.dense[n:, n:])[1]
     one = np.exp(density - density.max()).sum(axis=1 - number)
     below = np.concatenate([[0.0], np.cumsum(0.5 * (one[1:] + one[:-1]))])
     return np.interp([0.025, 0.975], below / below[-1], axes[number])

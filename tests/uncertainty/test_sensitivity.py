@@ -29,6 +29,7 @@ from palpate.uncertainty import (
     poisson_errors,
     surface_errors,
 )
+from palpate.unknowns import Alternative, Arrowhead
 
 NOISE = NoiseModel(np.array([0.3**2]), np.array([3.0]))
 VOXEL = 1.5  # mm, of the twin
@@ -98,7 +99,8 @@ def test_a_force_changes_with_poissons_ratio_as_differences_say(twin, dilatation
 
     term, there, seen = pulled(0.4)
     line = Linearisation(term, 0, seen, np.arange(0), None, np.ones(1), None, None)
-    evaluation = Evaluation(0.0, 0.0, *np.zeros((2, 0)), (line,), *np.zeros((2, 0)))
+    none, empty = np.zeros(0), Arrowhead.of(np.zeros((0, 0)))
+    evaluation = Evaluation(0.0, 0.0, none, empty, (line,), empty, none)
     found = poisson_errors(evaluation, (there,), dilatation)[0][0]
     (low,), (high,) = (pulled(0.4 + step)[2].values for step in (-h, h))
     slope, rest = (high - low) / (2.0 * h), twin.model.regions.index(3)
@@ -193,10 +195,10 @@ def test_a_wide_prior_and_no_prior_are_alike_and_a_narrow_one_is_not(path):
 def test_modes_that_are_dropped_are_as_if_they_had_never_been(twins, found, path):
     dropped = np.arange(12) >= 9
     foretold = path.shift(dropped=dropped).theta
-    narrow = np.diag(np.where(dropped, 1e8, 1.0))
+    narrow = (Alternative(np.diag(np.where(dropped, 1e-8, 1.0))),)
     objective = found.objective
     again = fast_path(
-        replace(objective, parameters=replace(objective.parameters, nuisance_precision=narrow)),
+        replace(objective, parameters=replace(objective.parameters, priors=narrow)),
         found.minimum,
         twins.settings(3.0).bounds,
     )

@@ -19,7 +19,7 @@ from palpate.inversion.optimise import LeastSquares
 from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
-from palpate.mechanics.reduced import ReducedModel
+from palpate.mechanics.reduced import ReducedModel, common_vectors
 from palpate.unknowns.parameters import ParameterMap
 
 ONE = np.ones(1)  # the coordinate of what no unknown moves
@@ -109,13 +109,14 @@ class FrozenState:
 
     Offsets of the residuals stand before the 1. expanded (n_regions,) kPa: E_0 where an expansion adds to the model, z
     = [a, q, ln E - ln E_0, 1]; form: Q (k, k), the residuals' part of the objective is 1/2 z^T Q z; square: S (k, k),
-    their mean square is z^T S z, mm^2.
+    their mean square is z^T S z, mm^2; common: how many first basis vectors are those of the first state.
     """
 
     reduced: ReducedModel
     expanded: NDArray[np.float64] | None
     form: NDArray[np.float64]
     square: NDArray[np.float64]
+    common: int = 0
 
     def coordinates(
         self,
@@ -128,20 +129,71 @@ class FrozenState:
         further = [] if self.expanded is None else [np.log(moduli / self.expanded)]
         return np.concatenate([amplitude, coefficients, *further, offsets, ONE])
 
-    def transposed_times(
-        self, values: NDArray[np.float64], amplitude_slopes: NDArray[np.float64], modulus_slopes: NDArray[np.float64]
+    def gradient(
+        self, force: NDArray[np.float64], amplitude_slopes: NDArray[np.float64], modulus_slopes: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """D^T y (n_own, r) for y (k, r), D the derivatives of z by the state's own unknowns.
+        """D^T y (n_own,) for y (k,), D the derivatives of z by the state's own unknowns.
 
         amplitude_slopes (m, n): of the amplitudes, by the first n of these, what acts on moduli and boundary modes;
         modulus_slopes (n_regions, n_moduli): of ln E by the former. The other coordinates are unknowns themselves.
         """
-        parts = [len(amplitude_slopes), len(amplitude_slopes) + self.reduced.n_modes]
-        amplitudes, coefficients, rest = np.split(values[:-1], parts)
-        expanded, offsets = np.split(rest, [0 if self.expanded is None else len(self.expanded)])
-        found = np.concatenate([modulus_slopes[: len(expanded)].T @ expanded, coefficients, offsets])
-        found[: amplitude_slopes.shape[1]] += amplitude_slopes.T @ amplitudes
-        return np.asarray(found)
+        m = len(amplitude_slopes)
+        found = self._by_others(force[m:-1], modulus_slopes)
+        found[: amplitude_slopes.shape[1]] += amplitude_slopes.T @ force[:m]
+        return found
+
+    def curvature(
+        self, amplitude_slopes: NDArray[np.float64], modulus_slopes: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """D^T Q D (n_own, n_own), of the same derivatives D = [A; B], B of all coordinates but the amplitudes.
+
+        It is B^T Q_bb B + W + W^T with W = A^T (Q_aa A / 2 + Q_ab B), and B is of zeros and ones but for ln E.
+        """
+        m, n = amplitude_slopes.shape
+        across = self._by_others(self.form[m:-1, :m], modulus_slopes)
+        across[:n] += (0.5 * amplitude_slopes.T) @ self.form[:m, :m]
+        found, half = self._of_others(self.form[m:-1, m:-1], modulus_slopes), across @ amplitude_slopes
+        found[:, :n] += half
+        found[:n] += half.T
+        return found
+
+    def _of_others(self, values: NDArray[np.float64], modulus_slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """B^T y B (n_own, n_own) of a symmetric y (k, k) of coordinates that are no amplitudes."""
+        n_moduli, places = modulus_slopes.shape[1], self._places(len(values), modulus_slopes)
+        size = places[-1][1].stop
+        found = np.zeros((size, size))
+        for row, to_row in places:
+            for column, to_column in places:
+                found[to_row, to_column] = values[row, column]
+        if self.expanded is not None:
+            expanded = slice(self.reduced.n_modes, self.reduced.n_modes + len(self.expanded))
+            for column, to_column in places:
+                found[:n_moduli, to_column] = modulus_slopes.T @ values[expanded, column]
+                found[to_column, :n_moduli] = found[:n_moduli, to_column].T
+            found[:n_moduli, :n_moduli] = modulus_slopes.T @ values[expanded, expanded] @ modulus_slopes
+        return found
+
+    def _by_others(self, values: NDArray[np.float64], modulus_slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """B^T y (n_own,) or (n_own, r) of coordinates (k,) or (k, r) that are no amplitudes."""
+        places = self._places(len(values), modulus_slopes)
+        found = np.zeros((places[-1][1].stop, *values.shape[1:]))
+        for row, to_row in places:
+            found[to_row] = values[row]
+        if self.expanded is not None:
+            expanded = slice(self.reduced.n_modes, self.reduced.n_modes + len(self.expanded))
+            found[: modulus_slopes.shape[1]] = modulus_slopes.T @ values[expanded]
+        return found
+
+    def _places(self, n_others: int, modulus_slopes: NDArray[np.float64]) -> tuple[tuple[slice, slice], ...]:
+        """Where coefficients and offsets stand among the coordinates that are no amplitudes, and among the unknowns."""
+        n_modes, n_moduli = self.reduced.n_modes, modulus_slopes.shape[1]
+        before = 0 if self.expanded is None else len(self.expanded)
+        offsets = n_others - before - n_modes
+        end = n_moduli + n_modes
+        return (
+            (slice(0, n_modes), slice(n_moduli, end)),
+            (slice(n_modes + before, n_others), slice(end, end + offsets)),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,17 +223,18 @@ class FrozenPosterior:
         parameters, prior = self.parameters, self.parameters.prior_matrix
         moduli, modulus_slopes = parameters.moduli(unknowns), parameters.derivatives(unknowns)
         believed, pull = parameters.prior(unknowns)
-        value, score, matrix, misfit = believed, pull.copy(), prior.copy(), 0.0
+        value, score, misfit = believed, pull.copy(), 0.0
+        blocks, first = list[tuple[NDArray[np.int64], NDArray[np.float64]]](), None
         for s, (state, coefficients) in enumerate(zip(self.states, parameters.coefficients(unknowns), strict=True)):
-            there, own = state.reduced.solve(moduli, coefficients), parameters.unknowns_of(s)
+            system = state.reduced.system(moduli, first, state.common)
+            first, there, own = first or system, system.solve(coefficients), parameters.unknowns_of(s)
             z = state.coordinates(there.amplitude, moduli, coefficients, parameters.offsets(unknowns, s))
-            amplitude_slopes, force = parameters.by_unknowns(there.amplitude_tangent(), unknowns), state.form @ z
+            amplitude_slopes, force = there.amplitude_tangent(modulus_slopes), state.form @ z
             value += 0.5 * float(z @ force)
             misfit += float(z @ (state.square @ z))
-            score[own] += state.transposed_times(force[:, None], amplitude_slopes, modulus_slopes)[:, 0]
-            halfway = state.transposed_times(state.form, amplitude_slopes, modulus_slopes)
-            matrix[np.ix_(own, own)] += state.transposed_times(halfway.T, amplitude_slopes, modulus_slopes)
-        return Evaluation(value, misfit, score, matrix, (), prior, pull, parameters.images, believed)
+            score[own] += state.gradient(force, amplitude_slopes, modulus_slopes)
+            blocks.append((own, state.curvature(amplitude_slopes, modulus_slopes)))
+        return Evaluation(value, misfit, score, prior.plus(blocks), (), prior, pull, believed)
 
 
 def frozen_posterior(
@@ -195,7 +248,7 @@ def frozen_posterior(
     evaluation = evaluation or objective(unknowns)
     parameters = objective.parameters
     moduli, coefficients = parameters.moduli(unknowns), parameters.coefficients(unknowns)
-    states = []
+    states = list[FrozenState]()
     for s, model in enumerate(fixed_correspondence(objective, unknowns, evaluation).models):
         reduced = model.like if isinstance(model, CurvedModel) else model
         if not isinstance(reduced, ReducedModel):
@@ -213,7 +266,9 @@ def frozen_posterior(
             answer[:, modes] += rest[:, model.n_regions :]
             answer = np.concatenate([answer[:, : modes.stop], rest[:, : model.n_regions]], axis=1)
         offsets = parameters.offsets(unknowns, s)
-        bare = FrozenState(reduced.outputs(lambda values: values[:0]), expanded, *(np.zeros((0, 0)),) * 2)
+        alone = reduced.outputs(lambda values: values[:0])
+        alone = replace(alone, coupling=np.ascontiguousarray(alone.coupling))
+        bare = FrozenState(alone, expanded, *(np.zeros((0, 0)),) * 2)
         z = bare.coordinates(bare.reduced.solve(moduli, coefficients[s]).amplitude, moduli, coefficients[s], offsets)
         form, square = np.zeros((len(z), len(z))), np.zeros((len(z), len(z)))
         for rows, term in zip(objective.states[s].slices, linearisations, strict=True):
@@ -230,7 +285,8 @@ def frozen_posterior(
             own = np.block([[by_z.gram(term.weights), side], [side.T, float(term.weights @ rest**2)]])
             form += term.precision * own
             square += own / len(evaluation.linearisations)
-        states.append(replace(bare, form=form, square=square))
+        common = common_vectors(states[0].reduced, bare.reduced) if states else 0
+        states.append(replace(bare, form=form, square=square, common=common))
     return FrozenPosterior(parameters, tuple(states))
 
 

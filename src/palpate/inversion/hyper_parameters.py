@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from scipy import linalg, optimize
 
 from palpate.approximation.contract import determined
-from palpate.inversion.by_image import among, solve_by_image
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.observation.contract import Observation
 from palpate.observation.noise_model import NoiseModel
-from palpate.unknowns.blocks import AMPLITUDES, LEAST_VARIANCE
+from palpate.unknowns.arrowhead import Arrowhead
+from palpate.unknowns.blocks import AMPLITUDES, LEAST_VARIANCE, Alternative
+from palpate.unknowns.parameters import ParameterMap
 
 FITTED = 0.5  # largest share of a kind's residuals that counts as fitted by the unknowns
 DRIVER_LN_SD = float(np.log(2.0))  # standard deviation of ln of a driver's scale over that of its kind
@@ -43,27 +44,26 @@ def with_scales(objective: Objective, evaluation: Evaluation) -> Objective:
     d/d ln s of 1/2 ln det H is -g, g = tr H^-1 J^T W J the number of unknowns that the residuals determine (MacKay
     1992): s^2 = n rho / (n - g) of a mean square rho where no outlier is.
     """
-    linearisations, found, inverse = evaluation.linearisations, dict[int, float](), np.zeros_like(evaluation.matrix)
-    matrix = evaluation.matrix
-    seen = np.flatnonzero(np.diag(matrix) > 0.0)
+    linearisations, found = evaluation.linearisations, dict[int, float]()
+    determine, inverse = list[float](), dict[int, NDArray[np.float64]]()
     with determined():
-        within = np.ix_(seen, seen)
-        images = among(evaluation.images, np.diag(matrix) > 0.0)
-        inverse[within] = solve_by_image(matrix[within], np.eye(len(seen)), images)
+        eliminated = evaluation.matrix.grounded().eliminated()
+        for term in linearisations:
+            if term.state not in inverse:  # all observations of a state have the same unknowns
+                inverse[term.state] = eliminated.inverse_among(term.columns)
+            determine.append(float(np.sum(inverse[term.state] * term.information)))
     for own, telling in of_one_noise(evaluation).values():
-        pooled = _scale([linearisations[i] for i in telling], inverse, 0.0)
+        pooled = _scale([linearisations[i] for i in telling], sum(determine[i] for i in telling), 0.0)
         apart = [i for i in own if i not in telling]
-        found |= dict.fromkeys(own, pooled) | {i: _scale([linearisations[i]], inverse, pooled) for i in apart}
+        found |= dict.fromkeys(own, pooled)
+        found |= {i: _scale([linearisations[i]], determine[i], pooled) for i in apart}
     pairs = enumerate(objective.observations)
     return objective.with_observations([o.with_sd(found[i]) for i, o in pairs])
 
 
-def _scale(linearisations: Sequence[Linearisation], inverse: NDArray[np.float64], least: float) -> float:
-    """The scale (mm) of some observations' residuals, at least `least`; inverse (n, n): H^-1."""
+def _scale(linearisations: Sequence[Linearisation], determine: float, least: float) -> float:
+    """The scale (mm) of some observations' residuals, at least `least`; these `determine` so many unknowns."""
     count = sum(term.observation.weighting.count for term in linearisations)
-    determine = 0.0
-    for term in linearisations:
-        determine += float(np.sum(inverse[np.ix_(term.columns, term.columns)] * term.information))
     low = max(least, *(term.observation.sd_bounds[0] for term in linearisations))
     high = min(term.observation.sd_bounds[1] for term in linearisations)
     if high <= low:
@@ -129,23 +129,18 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
     (MacKay 1992, Neural Computation 4, 415-447, section 4). Raises `EstimationError` where the images leave another
     unknown open.
     """
+    data = evaluation.matrix - evaluation.prior
+    pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
     for i, block in enumerate(objective.parameters.blocks):
         if block.terms:
-            own = objective.parameters.columns(i)
-            prior = objective.parameters.prior_matrix
-            data = evaluation.matrix - evaluation.prior
-            pull = (
-                data @ unknowns
-                - (evaluation.score - evaluation.prior_score)
-                + prior @ objective.parameters.prior_centre
-            )
+            parameters = objective.parameters
             with determined():
-                information, of_own = _seen_of(prior, data, pull, own)
+                pulled = pull + parameters.prior_matrix @ parameters.prior_centre
+                information, of_own = _seen_of(parameters, data, pulled, i)
                 terms = [term + LEAST_VARIANCE * np.eye(block.size) for term in block.terms]
                 variances = evident_variances(terms, information, of_own)
                 covariance = np.tensordot(variances, np.stack(terms), axes=1)
-                parameters = objective.parameters.believing({i: np.asarray(np.linalg.inv(covariance))})
-            objective = objective.believing(parameters)
+            objective = objective.believing(parameters.believing({i: Alternative(np.asarray(covariance))}))
     return objective
 
 
@@ -186,20 +181,16 @@ def evident_variances(
 
 
 def _seen_of(
-    prior: NDArray[np.float64], data: NDArray[np.float64], pull: NDArray[np.float64], columns: NDArray[np.int64]
+    parameters: ParameterMap, data: Arrowhead, pull: NDArray[np.float64], block: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What data say of k unknowns `columns` when all else follows: information (k, k) and pull (k,).
+    """What data say of the k unknowns of a block when all else follows: information (k, k) and pull (k,).
 
-    The Schur complement of the information `data` (n, n), the others under their `prior` (n, n), whose mean is in the
-    pull (n,).
+    The Schur complement of the information `data`, the others under their prior, whose mean is in the pull (n,).
     """
-    rest = np.setdiff1d(np.arange(len(pull)), columns)
-    across = data[np.ix_(rest, columns)]
-    matrix = data[np.ix_(rest, rest)] + prior[np.ix_(rest, rest)]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))[:, None]
-    scaled = scale * matrix * scale.T
-    scaled[np.diag_indices_from(scaled)] += 1e-10  # a modulus that moves nothing
-    right = np.column_stack([across, pull[rest]])
-    followed = across.T @ (scale * linalg.solve(scaled, scale * right, assume_a="pos", check_finite=False))
-    information = data[np.ix_(columns, columns)] - followed[:, :-1]
-    return 0.5 * (information + information.T), pull[columns] - followed[:, -1]
+    own = parameters.columns(block)
+    prior = parameters.prior_matrix.plus([(own, -parameters.priors[block].precision)])
+    matrix = data + prior
+    ridge = 1e-10 * np.maximum(matrix.diagonal, 1e-30)  # a modulus that moves nothing
+    ridge[own] = 0.0
+    information, of_own = matrix.plus_diagonal(ridge).complement(own, pull)
+    return 0.5 * (information + information.T), of_own

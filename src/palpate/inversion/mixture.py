@@ -6,8 +6,9 @@ posterior is nearly normal. The probability of an explanation is its evidence, b
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,14 @@ from scipy import linalg
 
 from palpate.approximation.contract import determined
 from palpate.errors import EstimationError, SolverError
-from palpate.inversion.by_image import Images, among, log_determinant
 from palpate.inversion.frozen_posterior import Posterior
 from palpate.inversion.objective import Evaluation
 from palpate.inversion.optimise import Bounds, Minimum, gauss_newton, posterior_sd, same_minimum
 from palpate.inversion.scenarios import Alternatives, alternatives_of, scenarios_of
+from palpate.mechanics.solvers.cholesky import backward, forward, lower_factor
 from palpate.parallel import mapped
+from palpate.unknowns.arrowhead import Arrowhead
+from palpate.unknowns.blocks import Alternative
 from palpate.unknowns.parameters import ParameterMap, Volume
 
 TRUSTED_SD = 0.5  # of ln E: how far residuals are taken for linear where explanations are compared first
@@ -216,7 +219,7 @@ def _laplace(posterior: Posterior, of: _Compared, begin: NDArray[np.float64], bo
     The log-evidence is -J - 1/2 ln det H + 1/2 ln det P, H = J^T W J + P.
     """
     own = posterior.believing(replace(posterior.parameters.choosing(dict(of.chosen)), volume=None))
-    n, start, images = own.n_parameters, begin.copy(), own.parameters.images
+    n, start = own.n_parameters, begin.copy()
     start[:n] = np.clip(start[:n], bounds.lower, bounds.upper)
     try:
         minimum = gauss_newton(own, start, bounds=bounds, tolerance=MINIMUM)
@@ -232,10 +235,9 @@ def _laplace(posterior: Posterior, of: _Compared, begin: NDArray[np.float64], bo
     there, theta = minimum.evaluation, minimum.unknowns[:n]
     if not np.isfinite(there.value):
         return None
-    parameters, precision = own.parameters, there.matrix.copy()
-    precision[np.arange(n), np.arange(n)] += 12.0 / (bounds.upper - bounds.lower) ** 2  # no more room than the bounds
-    believed = log_det(parameters.nuisance_precision, tuple(numbers - n for numbers in images))
-    determinants = believed - log_det(precision, images)
+    parameters, room = own.parameters, 12.0 / (bounds.upper - bounds.lower) ** 2  # theta has no more than its bounds
+    precision = there.matrix.plus([(np.arange(n), np.diag(room))])
+    determinants = sum(of.log_determinant for of in parameters.priors) - log_det(precision)
     added = 0.0 if parameters.volume is None else parameters.volume.at(theta)[0]
     level = of.log_prior + of.several + 0.5 * determinants - (there.value - added)
     return _Laplace(of, minimum, parameters.volume, level)
@@ -243,11 +245,11 @@ def _laplace(posterior: Posterior, of: _Compared, begin: NDArray[np.float64], bo
 
 def _volume(posterior: Posterior, minimum: Minimum) -> Volume:
     """How 1/2 ln det H_yy changes with theta at a minimum, by differences."""
-    n, images = posterior.n_parameters, tuple(own - posterior.n_parameters for own in minimum.evaluation.images)
+    n, others = posterior.n_parameters, np.arange(len(minimum.unknowns)) >= posterior.n_parameters
 
-    def room(matrix: NDArray[np.float64]) -> float:
+    def room(matrix: Arrowhead) -> float:
         """1/2 ln det H_yy."""
-        return 0.5 * log_det(matrix[n:, n:], images)
+        return 0.5 * log_det(matrix.among(others))
 
     here, slope = room(minimum.evaluation.matrix), np.zeros(n)
     for i in range(n):
@@ -257,25 +259,55 @@ def _volume(posterior: Posterior, minimum: Minimum) -> Volume:
     return Volume(slope, minimum.unknowns[:n])
 
 
-def log_det(matrix: NDArray[np.float64], images: Images = ()) -> float:
-    """Ln det of a positive definite matrix (n, n), without the unknowns that nothing depends on."""
-    seen = np.diag(matrix) > 0.0
-    return log_determinant(matrix[np.ix_(seen, seen)], among(images, seen)) if seen.any() else 0.0
+def log_det(matrix: Arrowhead) -> float:
+    """Ln det of a positive definite matrix, without the unknowns that nothing depends on."""
+    return matrix.grounded().log_determinant()
 
 
 @dataclass(frozen=True, slots=True)
 class _Eliminated:
-    """What an image's own unknowns y, under one of its alternatives, take from the shared ones.
+    """What an image's own unknowns y, under one of its alternatives P, take from the shared ones.
 
-    across (n_own, n_shared): X = (A_yy + P)^-1 A_ys; own (n_own,): z = (A_yy + P)^-1 b_y; taken (n_shared, n_shared)
-    and pull (n_shared,): A_sy X and A_sy z; level: 1/2 (b_y^T z - ln det(A_yy + P) + ln det P) with the log prior odds.
+    taken (n_shared, n_shared) and pull (n_shared,): A_sy (A_yy + P)^-1 A_ys and A_sy (A_yy + P)^-1 b_y; level: 1/2
+    (b_y^T (A_yy + P)^-1 b_y - ln det(A_yy + P) + ln det P) with the log prior odds. own (n_own,): their numbers in the
+    order in which they are eliminated, by `steps`.
     """
 
-    across: NDArray[np.float64]
-    own: NDArray[np.float64]
+    own: NDArray[np.int64]
+    steps: tuple[_Step, ...]
     taken: NDArray[np.float64]
     pull: NDArray[np.float64]
     level: float
+
+    def following(self, of_shared: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The unknowns `own` (n_own,) at their best beside shared ones (n_shared,)."""
+        found = np.append(of_shared, -1.0)
+        for step in reversed(self.steps):
+            found = np.concatenate([backward(step.factor, -step.border @ found), found])
+        return found[: len(self.own)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """A block of m unknowns eliminated before n others that follow, and a right-hand side.
+
+    factor L (m, m) of their matrix with its prior; border (m, n + 1): L^-1 of their rows of the others and the
+    right-hand side; left (n + 1, n + 1): what is left of these; determinant: ln det of the prior less that of L L^T.
+    """
+
+    factor: NDArray[np.float64]
+    border: NDArray[np.float64]
+    left: NDArray[np.float64]
+    determinant: float
+
+    @classmethod
+    def of(cls, matrix: NDArray[np.float64], prior: Alternative) -> _Step:
+        """The first m unknowns of a matrix (m + n + 1, m + n + 1) under their prior."""
+        m = len(prior.covariance)
+        factor = lower_factor(matrix[:m, :m] + prior.precision)
+        border = forward(factor, matrix[:m, m:])
+        determinant = prior.log_determinant - 2.0 * float(np.log(np.diag(factor)).sum())
+        return cls(factor, border, matrix[m:, m:] - border.T @ border, determinant)
 
 
 def _likeliest_together(gains: Sequence[Mapping[int, float]], most: int) -> dict[tuple[int, ...], float]:
@@ -285,6 +317,13 @@ def _likeliest_together(gains: Sequence[Mapping[int, float]], most: int) -> dict
         longer = [((*numbers, i), level + gain) for numbers, level in found for i, gain in of.items()]
         found = sorted((each for each in longer if each[1] > -SEEN), key=lambda each: -each[1])[:most]
     return dict(found)
+
+
+def _log_evidence(matrix: NDArray[np.float64], pull: NDArray[np.float64]) -> float:
+    """1/2 (b^T A^-1 b - ln det A) of a positive definite matrix A (n, n) and a pull b (n,)."""
+    factor = lower_factor(matrix)
+    target = forward(factor, pull)
+    return 0.5 * float(target @ target) - float(np.log(np.diag(factor)).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,36 +345,43 @@ class LinearEvidence:
         """That of residuals linear around unknowns (n_unknowns,), where moduli are trusted within `TRUSTED_SD`."""
         n, data = parameters.n_parameters, evaluation.matrix - evaluation.prior
         pull = data @ unknowns - (evaluation.score - evaluation.prior_score)
-        data[np.arange(n), np.arange(n)] += TRUSTED_SD**-2.0
+        data = data.plus([(np.arange(n), TRUSTED_SD**-2.0 * np.eye(n))])
         pull[:n] += TRUSTED_SD**-2.0 * unknowns[:n]
         owns = [parameters.of_image(state) for state in range(parameters.n_states)]
         shared = np.setdiff1d(np.arange(len(pull)), np.concatenate(owns))
-        images = [tuple(cls._eliminated(parameters, data, pull, s, own, shared)) for s, own in enumerate(owns)]
-        return cls(parameters, shared, data[np.ix_(shared, shared)], pull[shared], tuple(images))
+        images = [tuple(cls._eliminated(parameters, data, pull, s, shared)) for s in range(parameters.n_states)]
+        return cls(parameters, shared, data.block(shared, shared), pull[shared], tuple(images))
 
     @staticmethod
     def _eliminated(
         parameters: ParameterMap,
-        data: NDArray[np.float64],
+        data: Arrowhead,
         pull: NDArray[np.float64],
         state: int,
-        own: NDArray[np.int64],
         shared: NDArray[np.int64],
     ) -> Iterator[tuple[Alternatives, _Eliminated]]:
-        """Each alternative of a later state with what its own unknowns take."""
-        across, information, centre = data[np.ix_(own, shared)], data[np.ix_(own, own)], parameters.prior_centre[own]
-        for alternatives in alternatives_of(parameters.blocks, state):
-            prior = parameters.choosing(dict(alternatives.chosen)).prior_matrix[np.ix_(own, own)]
-            pulled = pull[own] + prior @ centre
-            factor = linalg.cho_factor(information + prior, lower=True, check_finite=False)
-            answer = linalg.cho_solve(factor, np.column_stack([across, pulled]), check_finite=False)
-            determinants = log_det(prior) - 2.0 * float(np.log(np.diag(factor[0])).sum())
-            level = 0.5 * (float(pulled @ answer[:, -1]) - float(centre @ prior @ centre) + determinants)
-            taken = across.T @ answer
-            yield (
-                alternatives,
-                _Eliminated(answer[:, :-1], answer[:, -1], taken[:, :-1], taken[:, -1], level + alternatives.log_odds),
-            )
+        """Each alternative of a later state with what its own unknowns take.
+
+        Block after block is eliminated, those that may be otherwise last: alternatives that begin alike share it.
+        """
+        every = alternatives_of(parameters.blocks, state)
+        open_ = list(dict.fromkeys(i for alternatives in every for i, _ in alternatives.chosen))
+        blocks = [*(i for i in parameters.blocks_of_image(state) if i not in open_), *open_]
+        own = np.concatenate([np.zeros(0, dtype=np.int64), *(parameters.columns(i) for i in blocks)])
+        border = np.column_stack([data.block(own, shared), pull[own]])
+        corner = np.zeros((border.shape[1],) * 2)
+        whole, known = np.block([[data.block(own, own), border], [border.T, corner]]), dict[tuple[int, ...], _Step]()
+        for alternatives in every:
+            chosen, steps, path = dict(alternatives.chosen), list[_Step](), tuple[int, ...]()
+            for i in blocks:
+                path = (*path, chosen.get(i, -1))
+                if path not in known:
+                    prior = parameters.blocks[i].alternatives[chosen[i]] if i in chosen else parameters.priors[i]
+                    known[path] = _Step.of(steps[-1].left if steps else whole, prior)
+                steps.append(known[path])
+            left = steps[-1].left if steps else corner
+            level = 0.5 * (sum(step.determinant for step in steps) - float(left[-1, -1])) + alternatives.log_odds
+            yield alternatives, _Eliminated(own, tuple(steps), -left[:-1, :-1], -left[:-1, -1], level)
 
     def compared(self, most: int) -> list[_Compared]:
         """The likeliest explanations, `most` at most: of each scenario the likeliest, and others of its images.
@@ -343,38 +389,38 @@ class LinearEvidence:
         Of several images the alternatives of each are chosen in turn, beside those of the others. Which combinations
         are likely is then told by what each of an image's alternatives loses alone.
         """
-        found, fewest = list[_Compared](), max(most // max(len(self.images), 1), FEWEST)
+        found, fewest = list[tuple[float, Callable[[], _Compared]]](), max(most // max(len(self.images), 1), FEWEST)
         for scenario in scenarios_of(self.parameters.blocks):
             found += self._of_scenario(scenario, most)
-        best = max(of.evidence for of in found)
-        found = sorted((of for of in found if of.evidence > best - SEEN), key=lambda of: -of.evidence)
-        return found[:fewest]
+        best = max(evidence for evidence, _ in found)
+        found = sorted((each for each in found if each[0] > best - SEEN), key=lambda each: -each[0])
+        return [minimum() for _, minimum in found[:fewest]]
 
-    def _of_scenario(self, scenario: Alternatives, most: int) -> list[_Compared]:
-        """Its likeliest explanation, and those that are seen beside it, `most` at most."""
+    def _of_scenario(self, scenario: Alternatives, most: int) -> list[tuple[float, Callable[[], _Compared]]]:
+        """Its likeliest explanation, and those seen beside it, `most` at most: evidence, and what finds the minimum."""
         parameters, shared = self.parameters.choosing(dict(scenario.chosen)), self.shared
-        prior, centre = parameters.prior_matrix[np.ix_(shared, shared)], parameters.prior_centre[shared]
+        prior, centre = parameters.prior_matrix.block(shared, shared), parameters.prior_centre[shared]
         n = parameters.n_parameters
-        own = 0.5 * (log_det(prior[n:, n:]) - float(centre @ prior @ centre)) + scenario.log_odds
+        own = 0.5 * (log_det(Arrowhead.of(prior[n:, n:])) - float(centre @ prior @ centre)) + scenario.log_odds
         information, pull = self.information + prior, self.pull + prior @ centre
 
-        def evidence(numbers: Sequence[int]) -> float:
-            """The log-evidence of alternatives by their number in each image."""
-            parts = [image[k][1] for image, k in zip(self.images, numbers, strict=True)]
-            factor = linalg.cholesky(information - sum(part.taken for part in parts), lower=True, check_finite=False)
-            target = linalg.solve_triangular(
-                factor, pull - sum(part.pull for part in parts), lower=True, check_finite=False
-            )
-            level = 0.5 * float(target @ target) - float(np.log(np.diag(factor)).sum())
-            return level + own + sum(part.level for part in parts)
+        def evidence(numbers: Sequence[int], k: int | None = None) -> list[float]:
+            """The log-evidence of alternatives by their number in each image, of all those of image k in its place."""
+            parts = [image[i][1] for j, (image, i) in enumerate(zip(self.images, numbers, strict=True)) if j != k]
+            matrix, right = information - sum(part.taken for part in parts), pull - sum(part.pull for part in parts)
+            level = own + sum(part.level for part in parts)
+            if k is None:
+                return [level + _log_evidence(matrix, right)]
+            each = [part for _, part in self.images[k]]
+            return [level + part.level + _log_evidence(matrix - part.taken, right - part.pull) for part in each]
 
         def others(numbers: tuple[int, ...], k: int) -> dict[tuple[int, ...], float]:
             """All explanations that differ from one in image k alone, and itself."""
             every = [(*numbers[:k], i, *numbers[k + 1 :]) for i in range(len(self.images[k]))]
-            return {each: evidence(each) for each in every}
+            return dict(zip(every, evidence(numbers, k), strict=True))
 
         numbers = tuple(max(range(len(image)), key=lambda i: image[i][1].level) for image in self.images)
-        by_image = [others(numbers, k) for k in range(len(self.images))]
+        by_image = [dict[tuple[int, ...], float]() for _ in self.images]
         for _ in range(ROUNDS if len(self.images) > 1 else 1):
             before = numbers
             for k in range(len(self.images)):
@@ -382,16 +428,20 @@ class LinearEvidence:
                 numbers = max(by_image[k], key=lambda each: by_image[k][each])
             if numbers == before:
                 break
-        by_image = [others(numbers, k) for k in range(len(self.images))] if len(self.images) > 1 else by_image
-        best = max(level for of in by_image for level in of.values()) if by_image else evidence(())
+        else:  # the first images' are of other alternatives of the last ones
+            by_image = [others(numbers, k) for k in range(len(self.images))] if len(self.images) > 1 else by_image
+        best = max(level for of in by_image for level in of.values()) if by_image else evidence(())[0]
         gains = [{each[k]: level - best for each, level in of.items()} for k, of in enumerate(by_image)]
         together = _likeliest_together(gains, most)
         every = [float(np.log(np.sum(np.exp(list(of.values()))))) for of in gains]
         several = sum(every) - float(np.log(np.sum(np.exp(list(together.values())))))
-        levels = {each: evidence(each) for each in together}
+        levels = {each: evidence(each)[0] for each in together}
         best = max(levels.values())
         seen = [(each, level) for each, level in levels.items() if level > best - SEEN]
-        return [self._compared(scenario, each, level + several, several, prior, pull) for each, level in seen]
+        return [
+            (level + several, partial(self._compared, scenario, each, level + several, several, prior, pull))
+            for each, level in seen
+        ]
 
     def _compared(
         self,
@@ -408,8 +458,8 @@ class LinearEvidence:
         of_shared = linalg.solve(matrix, pull - sum(part.pull for _, part in parts), assume_a="pos")
         unknowns = np.empty(self.parameters.n_unknowns)
         unknowns[self.shared] = of_shared
-        for state, (_, part) in enumerate(parts):
-            unknowns[self.parameters.of_image(state)] = part.own - part.across @ of_shared
+        for _, part in parts:
+            unknowns[part.own] = part.following(of_shared)
         chosen = scenario.chosen + tuple(pair for of, _ in parts for pair in of.chosen)
         odds = scenario.log_odds + sum(of.log_odds for of, _ in parts)
         words = tuple(of.words for of, _ in parts)

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.approximation.contract import Approximation, LinearisationPoint, determined
-from palpate.inversion.by_image import Images, among, solve_by_image
 from palpate.inversion.later_state import LaterState
 from palpate.mechanics.forward import Equilibrium
 from palpate.observation.contract import Observation, OfMaterial, Rematched, Residuals
 from palpate.observation.jacobian import Jacobian, jacobian_of
 from palpate.parallel import mapped
+from palpate.unknowns.arrowhead import Arrowhead
 from palpate.unknowns.parameters import ParameterMap
 
 
@@ -84,20 +84,18 @@ class Linearisation:
 class Evaluation:
     """Value (dimensionless, minus log-posterior) and the Gauss-Newton system.
 
-    matrix (n, n) = J^T W J + P and score (n,) = J^T W r + P (x - m) with the Jacobians J of smooth surfaces: the
-    estimate is where the score vanishes. prior (n, n): P, the precision of the unknowns before the images are seen;
-    prior_value,
-    prior_score (n,): its part of value and score. images: the unknowns that belong to each of several images alone.
+    matrix H = J^T W J + P and score (n,) = J^T W r + P (x - m) with the Jacobians J of smooth surfaces: the estimate is
+    where the score vanishes. prior: P, the precision of the unknowns before the images are seen; prior_score (n,),
+    prior_value: its part of score and value.
     """
 
     value: float
     misfit_mm2: float
     score: NDArray[np.float64]
-    matrix: NDArray[np.float64]
+    matrix: Arrowhead
     linearisations: tuple[Linearisation, ...]
-    prior: NDArray[np.float64]
+    prior: Arrowhead
     prior_score: NDArray[np.float64]
-    images: Images = ()
     prior_value: float = 0.0
 
     def covariance_columns(self, n_parameters: int) -> NDArray[np.float64]:
@@ -106,13 +104,13 @@ class Evaluation:
         The variance of a modulus that moves nothing is infinite, and that of no other. Raises `EstimationError` where
         neither images nor prior determine some other unknown.
         """
-        n, seen = len(self.matrix), np.diag(self.matrix) > 0.0
-        seen[n_parameters:] = True
-        within, images = np.ix_(seen, seen), among(self.images, seen)
-        found = np.diag(np.where(seen, 0.0, np.inf))[:, :n_parameters]
+        unseen = ~(self.matrix.diagonal > 0.0)
+        unseen[n_parameters:] = False
         with determined():
-            answer = solve_by_image(self.matrix[within], np.eye(n)[seen][:, :n_parameters], images)
-        found[seen] = answer
+            alone = self.matrix.plus_diagonal(unseen.astype(np.float64)) if unseen.any() else self.matrix
+            found = alone.solve(np.eye(self.matrix.size, n_parameters))
+        numbers = np.flatnonzero(unseen)
+        found[numbers, numbers] = np.inf
         return found
 
     def under(self, parameters: ParameterMap, unknowns: NDArray[np.float64]) -> Evaluation:
@@ -180,7 +178,7 @@ class Objective:
         directions, points = np.concatenate(every, axis=1), []
         for s, q in enumerate(coefficients):
             own, chain = mapping.unknowns_of(s), mapping.chain(s, unknowns)
-            metric = chain @ evaluations[0].matrix[np.ix_(own, own)] @ chain.T
+            metric = chain @ evaluations[0].matrix.block(own, own) @ chain.T
             points.append(LinearisationPoint(moduli, q, chain @ directions[own], metric, all_material))
         return points
 
@@ -214,15 +212,14 @@ class Objective:
         """The evaluation at `unknowns` (n_unknowns,) from all observations' residuals there, with their derivatives."""
         believed, pull = self.parameters.prior(unknowns)
         prior = self.parameters.prior_matrix
-        value, score, matrix, misfit = believed, pull.copy(), prior.copy(), 0.0
+        value, score, misfit = believed, pull.copy(), 0.0
         for term in linearisations:
             score[term.columns] += term.score
-            matrix[np.ix_(term.columns, term.columns)] += term.information
             loss = float(term.residuals.weights @ term.observation.weighting.loss.rho(term.residuals.values))
             misfit += loss / len(linearisations)
             value += 0.5 * term.precision * loss
-        images = self.parameters.images
-        return Evaluation(value, misfit, score, matrix, tuple(linearisations), prior, pull, images, believed)
+        matrix = prior.plus((term.columns, term.information) for term in linearisations)
+        return Evaluation(value, misfit, score, matrix, tuple(linearisations), prior, pull, believed)
 
     def weighed(
         self, unknowns: NDArray[np.float64], linearisations: Sequence[Linearisation], like: Sequence[Linearisation]
@@ -340,7 +337,7 @@ def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np
     parameters' part of the step, e_i^T H^-1 J^T W r = (J h_i)^T W r + ..., their gain (J h_i)^T W and their variance
     e_i^T H^-1 e_i, whose variation is -2 (dJ h_i)^T W J h_i. h_i is 0 of a modulus that moves nothing.
     """
-    unit = np.eye(len(evaluation.matrix))[:, :n_parameters]
+    unit = np.eye(evaluation.matrix.size, n_parameters)
     columns = evaluation.covariance_columns(n_parameters)
     return np.concatenate([unit, np.where(np.isfinite(columns), columns, 0.0)], axis=1)
 

@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import SolverError
-from palpate.inversion.by_image import Images, solve_by_image
 from palpate.inversion.objective import Evaluation
+from palpate.unknowns.arrowhead import Arrowhead, Eliminated
 
 RADIUS = 2.0  # largest trust radius of the log-moduli; the first one is half of it
 LEAST_DAMPING = 0.1  # of the diagonal: with less the step is nearly the refused one
 BAD = 0.25  # of the promised reduction: below, the radius shrinks; above 1 - 0.25 it grows (Nocedal & Wright, Alg. 4.1)
 TRIALS = 12  # trials of a step before it fails
 AT_BOUND = 1e-9  # of ln E: rounding of a mean of values at a bound
+RIDGE = 1e-12  # of the diagonal, which prevents a singular matrix
 SAME_MINIMUM = 0.02  # of ln E: minima that are nearer to each other count as one
 
 
@@ -225,7 +226,7 @@ def _search(
         step = trial - unknowns
         longest = float(np.abs(step[:n]).max(initial=0.0))
         slope = float(now.score @ step)
-        promised = -slope - 0.5 * step @ now.matrix @ step
+        promised = -slope - 0.5 * float(step @ (now.matrix @ step))
         spent += 1
         try:
             there = objective(trial)
@@ -252,19 +253,24 @@ def newton_step(now: Evaluation, free: NDArray[np.bool_], n_parameters: int) -> 
 
 def newton_decrement(now: Evaluation) -> float:
     """s^T H^-1 s / 2 of score s and Gauss-Newton matrix H: what a step of all unknowns still promises."""
-    return float(0.5 * now.score @ _solve(now.matrix, now.score[:, None], now.images)[:, 0])
+    eliminated = _ridged(now.matrix, 0).eliminated()
+    halves, right = eliminated.right(now.score)
+    return float(0.5 * now.score @ eliminated.followed(halves, _solve(eliminated.left, right[:, None])[:, 0]))
 
 
 @dataclass(frozen=True, slots=True)
 class _QuadraticModel:
     """An objective with the score s and the matrix H around a point, all but its free log-moduli eliminated.
 
-    free (n,): which unknowns move. Steps d of their log-moduli t and of the others q: H_qq d_q = -s_q - H_qt d_t, hence
-    d_q = -rest - slopes d_t, rest (m,) and slopes (m, k). matrix (k, k): H_tt - H_tq slopes; score (k,): s_t -
-    H_tq rest; diagonal (k,): of H_tt.
+    free (n,): which unknowns move. Each image's own unknowns are `eliminated`, halves (n_k,) are theirs of the score
+    (see `Eliminated`). Steps d of the free log-moduli t and the other shared unknowns q then have H_qq d_q = -s_q -
+    H_qt d_t, hence d_q = -rest - slopes d_t, rest (m,) and slopes (m, k). matrix (k, k): H_tt - H_tq slopes; score
+    (k,): s_t - H_tq rest; diagonal (k,): of H_tt before any elimination.
     """
 
     free: NDArray[np.bool_]
+    eliminated: Eliminated
+    halves: tuple[NDArray[np.float64], ...]
     matrix: NDArray[np.float64]
     score: NDArray[np.float64]
     diagonal: NDArray[np.float64]
@@ -277,33 +283,39 @@ class _QuadraticModel:
     ) -> _QuadraticModel:
         """Around an evaluation, with the damped matrix H + damping diag H."""
         moduli = np.flatnonzero(free[:n_parameters])
-        matrix = now.matrix + damping * np.diag(np.diag(now.matrix))
-        side, own = matrix[n_parameters:, moduli], matrix[np.ix_(moduli, moduli)]
-        images = tuple(numbers - n_parameters for numbers in now.images)
-        right = np.column_stack([side, now.score[n_parameters:]])
-        followed = _solve(matrix[n_parameters:, n_parameters:], right, images)
+        diagonal = now.matrix.diagonal
+        damped = now.matrix.plus_diagonal(damping * diagonal) if damping else now.matrix
+        eliminated = _ridged(damped, n_parameters).eliminated()
+        halves, right = eliminated.right(now.score)
+        left, side = eliminated.left, eliminated.left[n_parameters:, moduli]
+        followed = _solve(left[n_parameters:, n_parameters:], np.column_stack([side, right[n_parameters:]]))
         slopes, rest = followed[:, :-1], followed[:, -1]
-        diagonal = np.diag(now.matrix)[moduli]
-        return cls(free, own - side.T @ slopes, now.score[moduli] - side.T @ rest, diagonal, slopes, rest)
+        matrix, score = left[np.ix_(moduli, moduli)] - side.T @ slopes, right[moduli] - side.T @ rest
+        return cls(free, eliminated, halves, matrix, score, diagonal[moduli], slopes, rest)
 
     def step(self, radius: float = np.inf) -> NDArray[np.float64]:
         """Step (n,) to its minimum, or one whose log-moduli stay within the radius, by a ridge on these."""
-        step, weight = np.zeros(len(self.free)), 0.0
+        weight = 0.0
         for _ in range(60):
             theta = -_solve(self.matrix + weight * np.diag(self.diagonal), self.score[:, None])[:, 0]
             if np.abs(theta).max(initial=0.0) <= radius * 1.01:
                 break
             weight = max(2.0 * weight, 0.05)
-        step[self.free] = np.concatenate([theta, -self.rest - self.slopes @ theta])
-        return step
+        shared = np.zeros(len(self.eliminated.left))
+        shared[self.free[self.eliminated.places.shared]] = np.concatenate([theta, -self.rest - self.slopes @ theta])
+        return self.eliminated.followed([-half for half in self.halves], shared)
 
 
-def _solve(matrix: NDArray[np.float64], rhs: NDArray[np.float64], images: Images = ()) -> NDArray[np.float64]:
-    """Solve a positive semi-definite system (n, n) scaled to a unit diagonal for rhs (n, k), image by image.
+def _ridged(matrix: Arrowhead, first: int) -> Arrowhead:
+    """The same with a ridge on its unknowns from the `first` on."""
+    ridge = RIDGE * np.maximum(matrix.diagonal, 1e-30)
+    ridge[:first] = 0.0
+    return matrix.plus_diagonal(ridge)
 
-    A ridge of 1e-12 prevents a singular matrix.
-    """
+
+def _solve(matrix: NDArray[np.float64], rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Solve a positive semi-definite system (n, n) scaled to a unit diagonal for rhs (n, k), with a ridge."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))[:, None]
     scaled = scale * matrix * scale.T
-    scaled[np.diag_indices_from(scaled)] += 1e-12
-    return np.asarray(scale * solve_by_image(scaled, scale * rhs, images))
+    scaled[np.diag_indices_from(scaled)] += RIDGE
+    return np.asarray(scale * np.linalg.solve(scaled, scale * rhs))

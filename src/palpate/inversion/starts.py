@@ -92,12 +92,12 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
     middle, evaluations = fitted.unknowns, fitted.evaluations + 1
     # free the large derivatives of everything observed by all unknowns
     del objective, states, state, fitted, evaluation
-    informations = [data[np.ix_(own, own)] for own in columns]
+    informations = [data.block(own, own) for own in columns]
     bases = _combinations(parameters.blocks, informations, [state.model for state in start.states])
     fit = [inverse @ middle[own] for own, (_, inverse) in zip(columns, bases, strict=True)]
     unknowns = np.concatenate([theta, *fit])
     blocks = tuple(b.combined(inverse) for b, (_, inverse) in zip(parameters.blocks, bases, strict=True))
-    seen, informed = replace(parameters, blocks=blocks, nuisance_precision=np.zeros((0, 0))), list[LaterState]()
+    seen, informed = replace(parameters, blocks=blocks, priors=()), list[LaterState]()
     made = list[_Made]()
     progress(f"how the responses to the {seen.n_coefficients} unknowns that the images show change with the moduli")
     for s, (state, q) in enumerate(zip(start.states, seen.coefficients(unknowns), strict=True)):
@@ -224,7 +224,7 @@ def fit_coefficients(
         found = gauss_newton(LinearisedObjective(objective, unknowns, at), unknowns, bounds=still)
         step, unknowns = found.unknowns - unknowns, found.unknowns
         objective = objective.rematched(unknowns)
-        moved, at, evaluations = 0.5 * float(step @ at.matrix @ step), objective(unknowns), evaluations + 1
+        moved, at, evaluations = 0.5 * float(step @ (at.matrix @ step)), objective(unknowns), evaluations + 1
         if moved < tolerance * len(unknowns):
             return Minimum(unknowns, at, Outcome.CONVERGED, (), evaluations)
     return Minimum(unknowns, at, Outcome.STEPS, (), evaluations)

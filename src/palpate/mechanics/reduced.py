@@ -18,6 +18,7 @@ from scipy import linalg, sparse
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.forward import DenseEquilibrium, Outputs, checked_coefficients, checked_moduli
 from palpate.mechanics.linear_model import LinearModel, touched_rows
+from palpate.mechanics.solvers.cholesky import backward, forward, lower_factor
 from palpate.mechanics.solvers.conjugate_gradients import WORTH_THREADS, column_norms, times
 from palpate.parallel import mapped, processors
 
@@ -109,17 +110,40 @@ class ReducedModel:
             output_material=seen(self.output_material.astype(np.float64, copy=False)),
         )
 
-    def system(self, moduli: NDArray[np.float64]) -> ReducedSystem:
-        """The factorised reduced system at moduli (n_regions,) kPa; raises `SolverError`."""
+    def system(self, moduli: NDArray[np.float64], like: ReducedSystem | None = None, common: int = 0) -> ReducedSystem:
+        """The factorised reduced system at moduli (n_regions,) kPa; raises `SolverError`.
+
+        like: one at the same moduli, whose model has as many first basis vectors `common` (see `common_vectors`): their
+        part is not factorised again.
+        """
         checked = checked_moduli(moduli, self.names)
         try:
-            factor = linalg.cho_factor(np.tensordot(checked, self.stiffness, axes=1), lower=True, check_finite=False)
-        except linalg.LinAlgError as error:
+            if like is None or not common:
+                forces = _weighted(checked, self.coupling)
+                forces[:, -1] -= self.load
+                factor = lower_factor(_weighted(checked, self.stiffness))
+                halves = forward(factor, forces)
+            else:
+                factor, halves = self._bordered(checked, like, common)
+        except np.linalg.LinAlgError as error:
             raise self._indefinite(checked) from error
-        forces = np.tensordot(checked, self.coupling, axes=1)
-        forces[:, -1] -= self.load
-        amplitudes = -linalg.cho_solve(factor, forces, check_finite=False)
-        return ReducedSystem(self, checked, factor[0], amplitudes)
+        return ReducedSystem(self, checked, factor, halves, -backward(factor, halves))
+
+    def _bordered(
+        self, moduli: NDArray[np.float64], like: ReducedSystem, n: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Factor L (m, m) and L^-1 (C E - f) (m, n_boundary + 1), n of whose rows are known but for the last column."""
+        rows = _weighted(moduli, self.stiffness[:, n:])
+        forces, last = _weighted(moduli, self.coupling[:, n:]), moduli @ self.coupling[:, :n, -1] - self.load[:n]
+        forces[:, -1] -= self.load[n:]
+        first = np.asfortranarray(like.factor[:n, :n])
+        below = forward(first, rows[:, :n].T).T
+        factor, halves = np.zeros((self.n_basis,) * 2, order="F"), np.empty((self.n_basis, forces.shape[1]), order="F")
+        factor[:n, :n], factor[n:, :n] = first, below
+        factor[n:, n:] = corner = lower_factor(rows[:, n:] - below @ below.T)
+        halves[:n, :-1], halves[:n, -1] = like.halves[:n, :-1], forward(first, last)
+        halves[n:] = forward(corner, forces - below @ halves[:n])
+        return factor, halves
 
     def solve(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> ReducedEquilibrium:
         """Equilibrium at moduli (n_regions,) kPa and mode coefficients (n_modes,); raises `SolverError`."""
@@ -149,16 +173,33 @@ class ReducedModel:
         )
 
 
+def common_vectors(model: ReducedModel, other: ReducedModel) -> int:
+    """How many first basis vectors two models share, with all that is known of them but for offset and loads."""
+    n = min(model.n_basis, other.n_basis)
+    if model.coupling.shape[::2] != other.coupling.shape[::2]:
+        return 0
+    unlike = np.any(model.stiffness[:, :n, :n] != other.stiffness[:, :n, :n], axis=0)
+    unlike |= np.diag(np.any(model.coupling[:, :n, :-1] != other.coupling[:, :n, :-1], axis=(0, 2)))
+    return int(np.maximum(*np.nonzero(unlike)).min(initial=n))
+
+
+def _weighted(weights: NDArray[np.float64], matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum (m, k) of matrices (n, m, k), each times its weight (n,)."""
+    return np.asarray((weights @ matrices.reshape(len(weights), -1)).reshape(matrices.shape[1:]))
+
+
 @dataclass(frozen=True, slots=True)
 class ReducedSystem:
     """A reduced model at fixed moduli (n_regions,) kPa.
 
-    factor (m, m): lower Cholesky factor; amplitudes (m, n_boundary + 1): basis coefficients of every unit response.
+    factor L (m, m): lower Cholesky factor; amplitudes -L^-T h (m, n_boundary + 1): basis coefficients of every unit
+    response, of halves h (m, n_boundary + 1).
     """
 
     model: ReducedModel
     moduli: NDArray[np.float64]
     factor: NDArray[np.float64]
+    halves: NDArray[np.float64]
     amplitudes: NDArray[np.float64]
 
     def responses(self) -> NDArray[np.float64]:
@@ -179,7 +220,7 @@ class ReducedSystem:
 
     def backward(self, loads: NDArray[np.float64]) -> NDArray[np.float64]:
         """Basis coefficients (m, k) of the responses to reduced loads (m, k) mN."""
-        return np.asarray(linalg.cho_solve((self.factor, True), loads, check_finite=False))
+        return backward(self.factor, forward(self.factor, loads))
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,9 +232,13 @@ class ReducedEquilibrium(DenseEquilibrium):
     amplitude: NDArray[np.float64]
     values: NDArray[np.float64]
 
-    def amplitude_tangent(self) -> NDArray[np.float64]:
-        """Derivatives (m, n_regions + n_boundary) of the basis coefficients by ln E, then by the boundary modes."""
-        by_modulus = self.system.backward(-self._modulus_forces())
+    def amplitude_tangent(self, slopes: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """Derivatives (m, k + n_boundary) of the basis coefficients by what moves the moduli, then by boundary modes.
+
+        slopes (n_regions, k): of ln E by the former; None: ln E itself.
+        """
+        forces = -self._modulus_forces()
+        by_modulus = self.system.backward(forces if slopes is None else forces @ slopes)
         return np.concatenate([by_modulus, self.system.amplitudes[:, :-1]], axis=1)
 
     def tangent(self) -> NDArray[np.float64]:
@@ -215,9 +260,11 @@ class ReducedEquilibrium(DenseEquilibrium):
     def _modulus_forces(self) -> NDArray[np.float64]:
         """E_r (A_r a + B_r [q, 1]), (m, n_regions) mN."""
         model = self.system.model
-        forces = model.stiffness @ self.amplitude
-        forces += model.coupling @ np.append(self.coefficients[: model.n_boundary], 1.0)
-        return np.asarray((self.system.moduli[:, None] * forces).T)
+        given = np.append(self.coefficients[: model.n_boundary], 1.0)
+        # as one matrix each, for products of several matrices are slow
+        forces = model.stiffness.reshape(-1, model.n_basis) @ self.amplitude
+        forces += model.coupling.reshape(-1, len(given)) @ given
+        return np.asarray((self.system.moduli[:, None] * forces.reshape(model.n_regions, -1)).T)
 
 
 @dataclass(frozen=True, slots=True)

@@ -133,29 +133,32 @@ def fitted_materials(inversion: Inversion) -> tuple[FittedMaterial, ...]:
 def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> FoundDiscrepancy:
     """What the blocks of unknowns of a converged inversion say, with the fitted later states."""
     parameters, unknowns = inversion.objective.parameters, inversion.minimum.unknowns
-    n = parameters.n_parameters
     offsets, heterogeneity, layers = list[OffsetFound](), list[HeterogeneityFound](), list[LayerFound]()
     smooth, ratios, pair = dict[int, float](), list[PoissonRatioFound](), 0
-    rows = np.linalg.inv(inversion.minimum.evaluation.matrix)
+    eliminated = inversion.minimum.evaluation.matrix.eliminated()
+
+    def variances(own: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Posterior variances (n,) of unknowns with these numbers (n,)."""
+        return np.diag(eliminated.inverse_among(own))
+
     for number, block in enumerate(parameters.blocks):
         own = parameters.columns(number)
-        precision = parameters.nuisance_precision[np.ix_(own - n, own - n)]
-        learned = float(np.sqrt(np.mean(np.diag(np.linalg.inv(precision))))) if block.size else 0.0
+        learned = float(np.sqrt(np.mean(np.diag(parameters.priors[number].covariance)))) if block.size else 0.0
         if block.cause == "offset":
-            variance = block.widest[0, 0] if block.choice is Choice.HELD else rows[own[0], own[0]]
+            variance = block.widest[0, 0] if block.choice is Choice.HELD else variances(own)[0]
             value, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(variance))
             offsets.append(OffsetFound(block.of, block.states[0], value, (value - half, value + half)))
         elif block.cause == "heterogeneity":
             patchy = block.alternatives[1].covariance  # the first is nearly homogeneous, the last very patchy
             heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(np.mean(np.diag(patchy))))))
         elif block.cause == LAYER and inversion.mixture.explanations[0].chosen.get(number):
-            x, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(rows[own[0], own[0]]))
+            x, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(variances(own)[0]))
             low, ratio, high = np.exp([x - half, x, x + half]).tolist()
             layers.append(LayerFound(block.of, ratio, (low, high)))
         elif block.cause == "poisson":
             pair += 1
             model = inversion.objective.states[block.states[0]].model
-            found = zip(model.material.poisson, unknowns[own].tolist(), np.diag(rows)[own].tolist(), strict=True)
+            found = zip(model.material.poisson, unknowns[own].tolist(), variances(own).tolist(), strict=True)
             for group, shift, variance in found:  # the layers of a tissue have its ratio
                 tissue = model.space.mesh.tissues[group[0]]
                 fitted = min(tissue.poisson_ratio + shift, NEARLY_INCOMPRESSIBLE)

@@ -57,7 +57,7 @@ def information_shares(evaluation: Evaluation, n_parameters: int) -> list[dict[s
     """
     found = []
     for h in evaluation.covariance_columns(n_parameters).T:
-        parts = {"prior": float(h @ evaluation.prior @ h)}
+        parts = {"prior": float(h @ (evaluation.prior @ h))}
         for term in evaluation.linearisations:
             known = float(term.precision * term.weights @ term.jacobian.times(h[term.columns]) ** 2)
             parts[term.observation.kind] = parts.get(term.observation.kind, 0.0) + known
@@ -87,11 +87,12 @@ class _PairCoordinates:
         """The problem's evaluation at y (n_unknowns,), with its derivatives by y."""
         turn = self.turn(len(unknowns))
         there = self.fixed(turn @ unknowns)
+        shared = turn[np.ix_(*(there.matrix.places.shared,) * 2)]  # as the log-moduli are
         return replace(
             there,
             score=turn.T @ there.score,
-            matrix=turn.T @ there.matrix @ turn,
-            prior=turn.T @ there.prior @ turn,
+            matrix=there.matrix.turned(shared),
+            prior=there.prior.turned(shared),
             prior_score=turn.T @ there.prior_score,
         )
 

@@ -13,7 +13,6 @@ from scipy import sparse
 from palpate.images.distance import cropped, window_of
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
-from palpate.inversion.by_image import among
 from palpate.inversion.hyper_parameters import of_one_noise
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.mesh.space import LagrangeSpace
@@ -124,7 +123,7 @@ def covariance_of(
     inverse = rows.T
     for i, block in enumerate(objective.parameters.blocks):
         own = objective.parameters.columns(i)
-        part = inverse[own].T @ evaluation.prior[np.ix_(own, own)] @ inverse[own]
+        part = inverse[own].T @ evaluation.prior.block(own, own) @ inverse[own]
         causes[block.cause] = causes.get(block.cause, np.zeros_like(part)) + part
     return Covariance(noise, prior, grid, mesh, causes, held, left + mesh)
 
@@ -138,7 +137,7 @@ def _held(objective: Objective, evaluation: Evaluation, rows: NDArray[np.float64
     for i, block in enumerate(objective.parameters.blocks):
         if block.choice is Choice.HELD:
             own = objective.parameters.columns(i)
-            answer = rows @ (evaluation.matrix - evaluation.prior)[:, own]
+            answer = ((evaluation.matrix - evaluation.prior) @ rows.T)[own].T
             part = answer @ block.widest @ answer.T
             found[block.cause] = found.get(block.cause, np.zeros_like(part)) + part
     return found
@@ -147,8 +146,8 @@ def _held(objective: Objective, evaluation: Evaluation, rows: NDArray[np.float64
 def _given_model(objective: Objective, evaluation: Evaluation) -> Evaluation:
     """The evaluation with the unknowns of parameters and drivers alone, all others held where they are."""
     parameters = objective.parameters
-    kept = [parameters.columns(i) for i, block in enumerate(parameters.blocks) if block.cause == "driver"]
-    own = np.concatenate([np.arange(parameters.n_parameters), *kept])
+    drivers = [parameters.columns(i) for i, block in enumerate(parameters.blocks) if block.cause == "driver"]
+    own = np.concatenate([np.arange(parameters.n_parameters), *drivers])
     if len(own) == parameters.n_unknowns:
         return evaluation
     linearisations = []
@@ -157,15 +156,14 @@ def _given_model(objective: Objective, evaluation: Evaluation) -> Evaluation:
         columns, jacobian = np.searchsorted(own, term.columns[inside]), term.jacobian.of_columns(inside)
         score, information = term.score[inside], term.information[np.ix_(inside, inside)]
         linearisations.append(replace(term, columns=columns, jacobian=jacobian, score=score, information=information))
-    within = np.ix_(own, own)
+    kept = np.isin(np.arange(parameters.n_unknowns), own)
     return replace(
         evaluation,
         score=evaluation.score[own],
-        matrix=evaluation.matrix[within],
+        matrix=evaluation.matrix.among(kept),
         linearisations=tuple(linearisations),
-        prior=evaluation.prior[within],
+        prior=evaluation.prior.among(kept),
         prior_score=evaluation.prior_score[own],
-        images=among(evaluation.images, np.isin(np.arange(parameters.n_unknowns), own)),
     )
 
 
@@ -206,7 +204,7 @@ def sandwich_covariance(
 
 def covariance_among(objective: Objective, evaluation: Evaluation, numbers: NDArray[np.int64]) -> NDArray[np.float64]:
     """Covariance (k, k) of the unknowns with these `numbers` (k,): the sandwich, and what is held."""
-    rows = evaluation.covariance_columns(len(evaluation.matrix))[numbers]
+    rows = evaluation.covariance_columns(evaluation.matrix.size)[numbers]
     noise, prior = _sandwich(objective, evaluation, rows, error_noise(evaluation))
     return sum(_held(objective, evaluation, rows).values(), noise + prior)
 
@@ -221,7 +219,7 @@ def _sandwich(
     data = noise_covariance(
         objective, list(zip(evaluation.linearisations, _gain(evaluation, rows), strict=True)), noise_of
     )
-    return data, np.asarray(rows @ evaluation.prior @ rows.T)
+    return data, np.asarray(rows @ (evaluation.prior @ rows.T))
 
 
 def noise_covariance(
@@ -255,7 +253,7 @@ def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
     The residuals at a minimum are what the fit left of them: see `FitResponse`. What errors of one later image do to
     the residuals of another, by the moduli alone, is neglected.
     """
-    linearisations, n, found = evaluation.linearisations, len(evaluation.matrix), {}
+    linearisations, n, found = evaluation.linearisations, evaluation.matrix.size, {}
     inverse = evaluation.covariance_columns(n)
     for key, (own, telling) in of_one_noise(evaluation).items():
         jacobians, gains = list[Jacobian](), list[Jacobian]()

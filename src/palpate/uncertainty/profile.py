@@ -115,8 +115,8 @@ class Ray:
         slope = np.pad(self.direction, (0, len(evaluation.score) - n))
         still = self.held | self.bounds.reached(self.least.unknowns[:n])
         free = np.pad(~still, (0, len(slope) - n), constant_values=True)
-        pulled = evaluation.matrix[free][:, ~free] @ slope[~free]
-        slope[free] = -np.linalg.solve(evaluation.matrix[np.ix_(free, free)], pulled)
+        pulled = evaluation.matrix @ np.where(free, 0.0, slope)
+        slope[free] = -evaluation.matrix.among(free).solve(pulled[free])
         return slope
 
     def _at_its_best(self, start: NDArray[np.float64]) -> Minimum:

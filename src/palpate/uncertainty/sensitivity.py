@@ -82,11 +82,16 @@ class FastPath:
         """
         fixed, start, n = self.fixed, self.least.unknowns.copy(), self.fixed.n_parameters
         parameters = fixed.objective.parameters
-        wider = np.concatenate([np.full(b.size, width if b.cause == "driver" else 1.0) for b in parameters.blocks])
-        precision = parameters.nuisance_precision / np.outer(wider, wider)
+        priors = list(parameters.priors)
+        for i, block in enumerate(parameters.blocks):
+            covariance = (width if block.cause == "driver" else 1.0) ** 2 * priors[i].covariance
+            if dropped is not None:
+                held = DROPPED * np.diag(dropped[parameters.columns(i) - n])
+                covariance = np.asarray(np.linalg.inv(np.linalg.inv(covariance) + held))
+            priors[i] = replace(priors[i], covariance=covariance)
         if dropped is not None:
-            precision, start[n:] = precision + DROPPED * np.diag(dropped), np.where(dropped, 0.0, start[n:])
-        objective = replace(fixed.objective, parameters=replace(parameters, nuisance_precision=precision))
+            start[n:] = np.where(dropped, 0.0, start[n:])
+        objective = replace(fixed.objective, parameters=replace(parameters, priors=tuple(priors)))
         linearisations, there = fixed.linearisations, self.least.evaluation.linearisations
         if errors:
             linearisations, there = _moved(linearisations, errors), _moved(there, errors)

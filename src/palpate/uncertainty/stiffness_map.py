@@ -135,9 +135,9 @@ def stiffness_maps(inversion: Inversion, variances: NDArray[np.float64]) -> tupl
         elements = np.flatnonzero(mesh.region == tissue)
         first = int(np.searchsorted(parameters.acting(Acts.MATERIAL, state), own[0]))
         seen = model.material.fields[elements][:, first : first + block.size].toarray()
-        theta, n = parameters.tissues.index(block.of), parameters.n_parameters
+        theta = parameters.tissues.index(block.of)
         covariance = covariance_among(objective, minimum.evaluation, np.array([theta, *own]))
-        learned = np.asarray(np.linalg.inv(parameters.nuisance_precision[np.ix_(own - n, own - n)]), dtype=np.float64)
+        learned = parameters.priors[number].covariance
         stated = mesh.tissues[tissue].field
         assert stated is not None
         sd = stated.sd * float(np.sqrt(np.trace(learned) / np.trace(block.alternatives[0].covariance)))

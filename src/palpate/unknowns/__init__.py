@@ -1,5 +1,7 @@
 """The unknowns and their prior: log-moduli, and blocks of further unknowns."""
 
+from palpate.unknowns.arrowhead import Arrowhead as Arrowhead
+from palpate.unknowns.arrowhead import Places as Places
 from palpate.unknowns.blocks import FIELD as FIELD
 from palpate.unknowns.blocks import KNOWN_MODULUS as KNOWN_MODULUS
 from palpate.unknowns.blocks import LAYER as LAYER

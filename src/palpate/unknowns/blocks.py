@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,7 @@ LEAST_VARIANCE = 1e-3  # of a motion's coefficient, in its unit, so that no mode
 PATCHINESS = {"nearly homogeneous": 1.0 / 3.0, "patchy": 1.0, "very patchy": 2.0}
 OF_A_MAP = (1.0, 1.0, 2.0)  # the same of a tissue that is mapped, which is never taken for homogeneous
 PATCHY_ODDS = (0.0, -1.9, -3.8)
+HELD = 1e-8  # factor on the variance of a block that is held, which then does not move
 LAYER_ODDS = -1.9  # log prior odds that layers differ from their tissue: those of a patchy tissue
 
 
@@ -70,13 +72,23 @@ class Choice(Enum):
         return self in (Choice.FRAME, Choice.DRAWING)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Alternative:
     """One prior N(0, covariance (n, n)) of a block, its log prior odds, and its name for a reader."""
 
     covariance: NDArray[np.float64]
     log_odds: float = 0.0
     name: str = ""
+
+    @cached_property
+    def precision(self) -> NDArray[np.float64]:
+        """The covariance's inverse (n, n), formed once."""
+        return np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
+
+    @cached_property
+    def log_determinant(self) -> float:
+        """Ln det of the precision, found once."""
+        return -float(np.linalg.slogdet(self.covariance)[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +146,12 @@ class Block:
         would else take what a motion explains.
         """
         return 0 if self.choice.of_tissues else len(self.alternatives) - 1
+
+    @property
+    def begins(self) -> Alternative:
+        """The prior with which a search begins: that of its `first` alternative, next to none where it is held."""
+        first = self.alternatives[self.first]
+        return replace(first, covariance=HELD * first.covariance) if self.choice is Choice.HELD else first
 
     def combined(self, inverse: NDArray[np.float64]) -> Block:
         """The block of the combinations z = inverse x, inverse (k, n), what they leave out held at 0."""
@@ -316,14 +334,3 @@ def in_series_slopes(x: NDArray[np.float64], shares: NDArray[np.float64]) -> NDA
     """Derivatives dy / dx = s e^-x / (1 - s + s e^-x), (n,), of `in_series`."""
     softer = shares * np.exp(-x)
     return np.asarray(softer / (1.0 - shares + softer))
-
-
-HELD = 1e-8  # factor on the variance of a block that is held, which then does not move
-
-
-def joined(blocks: Sequence[Block]) -> NDArray[np.float64]:
-    """Precision (n, n) with which a search begins of the unknowns of several blocks, one after the other."""
-    covariances = [
-        (HELD if block.choice is Choice.HELD else 1.0) * block.alternatives[block.first].covariance for block in blocks
-    ]
-    return np.asarray(linalg.block_diag(np.zeros((0, 0)), *map(np.linalg.inv, covariances)))

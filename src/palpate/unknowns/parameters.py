@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -14,7 +15,8 @@ from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
-from palpate.unknowns.blocks import KNOWN_MODULUS, Acts, Block, in_series, in_series_slopes, joined
+from palpate.unknowns.arrowhead import Arrowhead, Places
+from palpate.unknowns.blocks import KNOWN_MODULUS, Acts, Alternative, Block, in_series, in_series_slopes
 
 LOADS = "the known loads"
 LEVELS_OFF = 1.5  # of ln E: distance from a place at which the room that theta leaves all others levels off
@@ -63,8 +65,7 @@ class _Layout:
     """Where the unknowns of blocks stand among all: of each block (n,), and by how they act in which state (n,).
 
     on_moduli (n,): those that act on moduli, in every later state; shares (n,): theirs; of_regions (n_regions, n): 1
-    where such an unknown is one of a region; images: of each later state those that act in it alone, () where fewer
-    than two states have any.
+    where such an unknown is one of a region; places: those of one later state alone, and all others.
     """
 
     blocks: tuple[NDArray[np.int64], ...]
@@ -72,7 +73,7 @@ class _Layout:
     on_moduli: NDArray[np.int64]
     shares: NDArray[np.float64]
     of_regions: NDArray[np.float64]
-    images: tuple[NDArray[np.int64], ...]
+    places: Places
 
     @classmethod
     def of(cls, blocks: Sequence[Block], first: int, n_regions: int) -> _Layout:
@@ -88,7 +89,6 @@ class _Layout:
         acting = {(a, k): joint([p for b, p in pairs if b.acts is a and k in b.states]) for a in Acts for k in states}
         own = [block for block in blocks if block.acts is Acts.MODULI]
         of_one = [joint([place for block, place in pairs if block.states == (k,)]) for k in sorted(states)]
-        images = tuple(numbers for numbers in of_one if len(numbers))
         of_regions = [np.isin(np.arange(n_regions), block.regions) for block in own]
         return cls(
             places,
@@ -96,7 +96,7 @@ class _Layout:
             joint([place for block, place in pairs if block.acts is Acts.MODULI]),
             np.array([block.share for block in own]),
             np.array(of_regions, dtype=np.float64).reshape(len(own), n_regions).T,
-            images if len(images) > 1 else (),
+            Places.of(int(ends[-1]), of_one),
         )
 
 
@@ -117,7 +117,7 @@ class Volume:
         return float(LEVELS_OFF * self.slope @ away), np.asarray(self.slope * (1.0 - away**2))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ParameterMap:
     """Unknowns x = [theta, x_1, ..., x_B] (n_unknowns,): the parameters theta, then those of the `blocks`.
 
@@ -129,9 +129,9 @@ class ParameterMap:
     state takes its `coefficients`: of its boundary modes, then of its material modes, in the order of the blocks.
 
     The prior is normal: theta with `prior_mean` (n_parameters,) and `prior_precision` (n_parameters, n_parameters),
-    flat by default, the blocks' unknowns with the mean 0 and `nuisance_precision` (n_coefficients, n_coefficients), by
-    default what the blocks believe. `volume`: what integrating over the blocks' unknowns adds to J as a function of
-    theta; None: nothing, the blocks' unknowns are sought. Raises `ConfigurationError` for a prior of another shape.
+    flat by default, the blocks' unknowns with the mean 0 and one of the `priors` for each block, by default what the
+    blocks believe. `volume`: what integrating over the blocks' unknowns adds to J as a function of theta; None:
+    nothing, the blocks' unknowns are sought. Raises `ConfigurationError` for a prior of another shape.
     """
 
     base: NDArray[np.float64]
@@ -142,7 +142,7 @@ class ParameterMap:
     blocks: tuple[Block, ...]
     prior_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     prior_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
-    nuisance_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    priors: tuple[Alternative, ...] = ()
     poisson: tuple[OpenPoisson, ...] = ()
     volume: Volume | None = None
     _layout: _Layout = field(init=False, repr=False, compare=False)
@@ -150,16 +150,17 @@ class ParameterMap:
     def __post_init__(self) -> None:
         n = self.n_parameters
         object.__setattr__(self, "_layout", _Layout.of(self.blocks, n, len(self.base)))
-        k = self.n_coefficients
-        for name, shape in {"prior_mean": (n,), "prior_precision": (n, n), "nuisance_precision": (k, k)}.items():
+        for name, shape in {"prior_mean": (n,), "prior_precision": (n, n)}.items():
             given = getattr(self, name)
-            if not given.size:  # inverses of all blocks' covariances are formed only where they are asked for
-                blank = joined(self.blocks) if name == "nuisance_precision" else np.zeros(shape)
-                object.__setattr__(self, name, blank)
+            if not given.size:
+                object.__setattr__(self, name, np.zeros(shape))
             elif given.shape != shape:
-                raise ConfigurationError(
-                    f"{name} has the shape {given.shape}; {n} parameters and {k} unknowns in blocks need {shape}"
-                )
+                raise ConfigurationError(f"{name} has the shape {given.shape}; {n} parameters need {shape}")
+        if not self.priors:
+            object.__setattr__(self, "priors", tuple(block.begins for block in self.blocks))
+        sizes = [[len(of.covariance) for of in self.priors], [block.size for block in self.blocks]]
+        if sizes[0] != sizes[1]:
+            raise ConfigurationError(f"the priors are of {sizes[0]} unknowns, the blocks have {sizes[1]}")
 
     @property
     def by_load(self) -> bool:
@@ -212,21 +213,19 @@ class ParameterMap:
         return self._layout.blocks[block]
 
     @property
-    def images(self) -> tuple[NDArray[np.int64], ...]:
-        """Numbers (n,) of the unknowns that belong to each later state alone; () where fewer than two have any."""
-        return self._layout.images
+    def places(self) -> Places:
+        """Which unknowns belong to each later state alone, and which several share, as the log-moduli are."""
+        return self._layout.places
 
     def acting(self, acts: Acts, state: int) -> NDArray[np.int64]:
         """Numbers (n,) of the unknowns that act so in a later state, in the order of the blocks."""
         return self._layout.acting.get((acts, state), np.zeros(0, dtype=np.int64))
 
-    @property
-    def prior_matrix(self) -> NDArray[np.float64]:
-        """Precision P (n_unknowns, n_unknowns) of all unknowns before the images are seen."""
-        n, matrix = self.n_parameters, np.zeros((self.n_unknowns, self.n_unknowns))
-        matrix[:n, :n] = self.prior_precision
-        matrix[n:, n:] = self.nuisance_precision
-        return matrix
+    @cached_property
+    def prior_matrix(self) -> Arrowhead:
+        """Precision P of all unknowns before the images are seen."""
+        of_blocks = [(place, of.precision) for place, of in zip(self._layout.blocks, self.priors, strict=True)]
+        return Arrowhead.zeros(self.places).plus([(np.arange(self.n_parameters), self.prior_precision), *of_blocks])
 
     @property
     def prior_centre(self) -> NDArray[np.float64]:
@@ -322,31 +321,28 @@ class ParameterMap:
         kept = [i for i, block in enumerate(self.blocks) if state in block.states]
         blocks = tuple(replace(self.blocks[i], states=(0,)) for i in kept)
         own = np.concatenate([np.arange(self.n_parameters), *(self.columns(i) for i in kept)])
-        nuisance = own[self.n_parameters :] - self.n_parameters
-        precision = self.nuisance_precision[np.ix_(nuisance, nuisance)]
         share = self.volume and replace(self.volume, slope=self.volume.slope / self.n_states)
-        return replace(self, blocks=blocks, nuisance_precision=precision, volume=share), own
+        return replace(self, blocks=blocks, priors=tuple(self.priors[i] for i in kept), volume=share), own
 
     def _model_columns(self, state: int) -> NDArray[np.int64]:
         return np.concatenate([self.acting(Acts.BOUNDARY, state), self.acting(Acts.MATERIAL, state)])
 
-    def believing(self, priors: Mapping[int, NDArray[np.float64]]) -> ParameterMap:
-        """The same with the precisions (n, n) of some blocks, by their numbers."""
-        precision, n = self.nuisance_precision.copy(), self.n_parameters
-        for number, own in priors.items():
-            columns = self.columns(number) - n
-            precision[np.ix_(columns, columns)] = own
-        return replace(self, nuisance_precision=precision)
+    def believing(self, priors: Mapping[int, Alternative]) -> ParameterMap:
+        """The same with other priors of some blocks, by their numbers."""
+        return replace(self, priors=tuple(priors.get(i, own) for i, own in enumerate(self.priors)))
 
     def choosing(self, chosen: Mapping[int, int]) -> ParameterMap:
         """The same with the alternative priors of blocks, by the numbers of both."""
-        every = {i: self.blocks[i].alternatives[k].covariance for i, k in chosen.items()}
-        return self.believing({i: np.asarray(np.linalg.inv(covariance)) for i, covariance in every.items()})
+        return self.believing({i: self.blocks[i].alternatives[k] for i, k in chosen.items()})
+
+    def blocks_of_image(self, state: int) -> list[int]:
+        """Numbers of the blocks of how a later image moves and is drawn, which no other image has."""
+        own = (Acts.BOUNDARY, Acts.RESIDUALS)
+        return [i for i, b in enumerate(self.blocks) if b.acts in own and b.states == (state,)]
 
     def of_image(self, state: int) -> NDArray[np.int64]:
-        """Numbers (n,) of the unknowns of how a later image moves and is drawn, which no other image has."""
-        own = (Acts.BOUNDARY, Acts.RESIDUALS)
-        places = [self.columns(i) for i, b in enumerate(self.blocks) if b.acts in own and b.states == (state,)]
+        """Numbers (n,) of the unknowns of these blocks."""
+        places = [self.columns(i) for i in self.blocks_of_image(state)]
         return np.concatenate([np.zeros(0, dtype=np.int64), *places])
 
     def with_prior(self, mean: NDArray[np.float64], sd: NDArray[np.float64]) -> ParameterMap:
