@@ -62,9 +62,10 @@ class FixedCorrespondence:
             tangent = mapping.by_unknowns(there.tangent(), unknowns)
             offset = mapping.offsets(unknowns - self.unknowns, s)
             for rows, (term, before) in zip(state.slices, left, strict=False):
-                n_dofs, by_offset = len(before), term.jacobian.tangent[len(before), tangent.shape[1] :] @ offset
+                n_dofs, drawn = len(before), term.jacobian.tangent[: len(before) + 1, tangent.shape[1] :] @ offset
                 material = term.jacobian.tangent[n_dofs + 1 :] @ (unknowns - self.unknowns)[term.columns]
-                moved = np.concatenate([there.values[rows] - before, [by_offset], material])
+                drawn[:n_dofs] += there.values[rows] - before
+                moved = np.concatenate([drawn, material])
                 values = term.residuals.values + term.jacobian.by_displacement @ moved
                 jacobian = term.jacobian.under(tangent[rows])
                 residuals = replace(term.residuals, values=values)

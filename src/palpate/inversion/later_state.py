@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ from palpate.errors import ConfigurationError
 from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.linear_model import LinearModel
-from palpate.observation.contract import Float, Observation, OfMaterial, n_seen, seen_by
+from palpate.observation.contract import Float, Imaged, Observation, OfMaterial, n_seen, seen_by
 from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns.parameters import ParameterMap
 
@@ -26,7 +26,8 @@ class LaterState:
     model: the body under the linear law; finite_strain: under the law that the estimate is continued to, None where
     that is the linear one; reference: number of the rest state that it belongs to; observed: the approximation's model
     of what is observed alone, one observation after the other; bending: the linear law's approximation, whose
-    curvature an expansion under another law lacks.
+    curvature an expansion under another law lacks; at_rest: modes (n_dofs, m) mm by which the reference image may draw
+    the surface of an observation otherwise, by its name.
     """
 
     model: LinearModel
@@ -36,6 +37,7 @@ class LaterState:
     approximation: Approximation | None = field(default=None, repr=False)
     observed: ForwardModel | None = field(default=None, repr=False)
     bending: Approximation | None = field(default=None, repr=False)
+    at_rest: Mapping[str, NDArray[np.float64]] = field(default_factory=dict, repr=False)
 
     @property
     def noise(self) -> dict[str, NoiseModel]:
@@ -52,10 +54,24 @@ class LaterState:
         """What is observed (n_observed,) or (n_observed, k) of displacements (n_dof,) or (n_dof, k) mm, in order."""
         return np.concatenate([seen_by(observation, displacement) for observation in self.observations])
 
+    def modes_at_rest(
+        self, observation: Observation, which: Mapping[str, slice]
+    ) -> tuple[slice, NDArray[np.float64]] | None:
+        """The modes (n_dofs, m) mm of a surface at rest, and `which` unknowns they are; None where it has none."""
+        if observation.name not in which or not isinstance(observation, Imaged):
+            return None
+        return which[observation.name], self.at_rest[observation.name]
+
     def combined(
-        self, boundary: NDArray[np.float64], fields: NDArray[np.float64], like: LinearModel | None = None
+        self,
+        boundary: NDArray[np.float64],
+        fields: NDArray[np.float64],
+        at_rest: Mapping[str, NDArray[np.float64]],
+        like: LinearModel | None = None,
     ) -> LaterState:
         """The same state with models on combinations of boundary modes (n_boundary, k) and of fields (n_fields, l).
+
+        at_rest: combinations (m, j) of the modes of surfaces at rest, by their names.
 
         like: the model of another state of the body on the same combinations, whose modes and material serve again.
         """
@@ -71,7 +87,8 @@ class LaterState:
         finite = self.finite_strain and replace(self.finite_strain.under(conditions), material=material)
         model = replace((like or self.model).under(conditions), material=material)
         seen = tuple(o.combined(fields) if isinstance(o, OfMaterial) else o for o in self.observations)
-        return replace(self, model=model, observations=seen, finite_strain=finite)
+        drawn = {name: modes @ at_rest[name] for name, modes in self.at_rest.items()}
+        return replace(self, model=model, observations=seen, finite_strain=finite, at_rest=drawn)
 
     def with_approximation(self, approximation: Approximation) -> LaterState:
         """The same state with another approximation of its model."""

@@ -243,7 +243,7 @@ class Objective:
             (observation, motion), offset = of
             return observation.rematched(motion, offset) if isinstance(observation, Rematched) else observation
 
-        seen = [self._seen(s, self._equilibrium(s, unknowns).values) for s in range(len(self.states))]
+        seen = [self._seen(s, self._equilibrium(s, unknowns).values, unknowns) for s in range(len(self.states))]
         offsets = [self._offsets(s, unknowns) for s in range(len(self.states))]
         pairs = zip(itertools.chain.from_iterable(seen), itertools.chain.from_iterable(offsets), strict=True)
         return self.with_observations(mapped(fresh, pairs))
@@ -253,10 +253,18 @@ class Objective:
         assert observed is not None, "an objective is made of states with approximations"
         return observed.solve(self.parameters.moduli(unknowns), self.parameters.coefficients(unknowns)[s])
 
-    def _seen(self, s: int, values: NDArray[np.float64]) -> list[tuple[Observation, NDArray[np.float64]]]:
-        """Each observation of a state with its displacements (n_dofs,) mm."""
-        state = self.states[s]
-        return [(o, values[rows]) for o, rows in zip(state.observations, state.slices, strict=True)]
+    def _seen(
+        self, s: int, values: NDArray[np.float64], unknowns: NDArray[np.float64]
+    ) -> list[tuple[Observation, NDArray[np.float64]]]:
+        """Each observation of a state with its displacements (n_dofs,) mm from where the reference image draws it."""
+        state, drawn, found = self.states[s], self.parameters.offsets(unknowns, s), []
+        at_rest = self.parameters.at_rest(s)
+        for observation, rows in zip(state.observations, state.slices, strict=True):
+            motion = values[rows]
+            if modes := state.modes_at_rest(observation, at_rest):
+                motion = motion + modes[1] @ drawn[modes[0]]
+            found.append((observation, motion))
+        return found
 
     def _residuals(
         self, s: int, values: NDArray[np.float64], unknowns: NDArray[np.float64]
@@ -271,7 +279,7 @@ class Objective:
             here = observation.under(*material) if isinstance(observation, OfMaterial) else observation
             return observation, here.residuals(motion, offset)
 
-        return mapped(seen, zip(self._seen(s, values), self._offsets(s, unknowns), strict=True))
+        return mapped(seen, zip(self._seen(s, values, unknowns), self._offsets(s, unknowns), strict=True))
 
     def _by_material(self, s: int, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives (n_regions + n_material, k) of ln E and the material of a state by theta and coefficients."""
@@ -282,7 +290,7 @@ class Objective:
 
     def _offsets(self, s: int, unknowns: NDArray[np.float64]) -> list[float]:
         """The offset of each observation of a state, 0 where it has none."""
-        known = dict(zip(self.parameters.offset_names(s), self.parameters.offsets(unknowns, s).tolist(), strict=True))
+        known = dict(zip(self.parameters.offset_names(s), self.parameters.offsets(unknowns, s).tolist(), strict=False))
         return [known.get(o.name, 0.0) for o in self.states[s].observations]
 
     def _linearised(self, s: int, unknowns: NDArray[np.float64]) -> list[Linearisation]:
@@ -291,6 +299,7 @@ class Objective:
         n_offsets = len(self.parameters.offsets(unknowns, s))
         seen = self._residuals(s, solution.values, unknowns)
         numbers = {name: number for number, name in enumerate(self.parameters.offset_names(s))}
+        at_rest = self.parameters.at_rest(s)
 
         def linearised(of: tuple[slice, tuple[Observation, Residuals]]) -> Linearisation:
             """One observation's residuals with their derivative."""
@@ -298,7 +307,10 @@ class Objective:
             direct = None if residuals.direct is None else (residuals.direct, self._by_material(s, unknowns))
             number = numbers.get(observation.name)
             own = self.parameters.by_unknowns(tangent[rows], unknowns)
-            jacobian = jacobian_of(residuals.jacobian, own, number=number, n_offsets=n_offsets, direct=direct)
+            drawn = state.modes_at_rest(observation, at_rest)
+            jacobian = jacobian_of(
+                residuals.jacobian, own, number=number, n_offsets=n_offsets, direct=direct, at_rest=drawn
+            )
             weights = _robust_weights(observation, residuals)
             return Linearisation.of(observation, s, residuals, columns, jacobian, weights)
 
@@ -345,4 +357,3 @@ def deciding_directions(evaluation: Evaluation, n_parameters: int) -> NDArray[np
 def _robust_weights(observation: Observation, residuals: Residuals) -> NDArray[np.float64]:
     """The weights (n,) of residuals, times the robust weights of the loss."""
     return np.asarray(residuals.weights * observation.weighting.loss.weight(residuals.values))
-

@@ -110,7 +110,9 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
         fields = material[: material.shape[0] - n_poisson, : material.shape[1] - n_poisson]
         modes = state.model.constraint.modes
         like = next((of for of in made if of.modes is modes and np.array_equal(of.boundary, boundary)), None)
-        reduced = state.combined(boundary, fields, like.projection.model if like else None)
+        pairs = zip(parameters.blocks, bases, strict=True)
+        at_rest = {b.of: basis for b, (basis, _) in pairs if b.acts is Acts.REFERENCE and s in b.states}
+        reduced = state.combined(boundary, fields, at_rest, like.projection.model if like else None)
         responses = found.pop(0)
         projected = like.projection.under(reduced.model) if like else responses.projected(reduced.model, boundary)
         made += [] if like else [_Made(modes, boundary, projected)]

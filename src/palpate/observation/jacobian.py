@@ -97,10 +97,12 @@ def jacobian_of(
     number: int | None,
     n_offsets: int,
     direct: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+    at_rest: tuple[slice, NDArray[np.float64]] | None = None,
 ) -> Jacobian:
     """Of residuals with derivatives smooth (n, n_dofs) by displacements, these with tangent (n_dofs, k) by unknowns.
 
-    Columns of n_offsets offsets follow, of which that with a `number` is the residuals' own; None: they have none.
+    Columns of n_offsets offsets follow, of which that with a `number` is the residuals' own; None: they have none. Some
+    of these may be modes (n_dofs, m) mm of the surface `at_rest`.
     """
     ones, (n_dofs, k) = sparse.csr_matrix(np.ones((smooth.shape[0], 1))), tangent.shape
     held = direct or (np.zeros((smooth.shape[0], 0)), np.zeros((0, k)))
@@ -108,4 +110,7 @@ def jacobian_of(
     rows[:n_dofs, :k], rows[n_dofs + 1 :, :k] = tangent, held[1]
     if n_offsets and number is not None:
         rows[n_dofs, k + number] = 1.0
+    if at_rest is not None:
+        which, modes = at_rest
+        rows[:n_dofs, k + which.start : k + which.stop] = modes
     return Jacobian(sparse.csr_matrix(sparse.hstack([smooth, ones, sparse.csr_matrix(held[0])], format="csr")), rows)

@@ -20,6 +20,7 @@ CAUSES = {
     "driver": "the drivers' motion",
     "frame": "the frame's motion",
     "offset": "how surfaces are drawn",
+    "reference": "how the reference image is drawn",
     "heterogeneity": "tissues that are not homogeneous",
     FIELD: "what is mapped",
     "layer": "layers round the organs",

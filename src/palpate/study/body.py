@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +28,11 @@ from palpate.mesh.quality import MeshQuality, mesh_figures
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import Imaged, ImagedBody, Observation, OfInstrument
+from palpate.observation.drawn_at_rest import UNIT_MM, modes_at_rest
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.prescribed_motion import FrameMotion, PrescribedMotion, bone_offset, prescribed_motion
 from palpate.observation.registry import observations
+from palpate.observation.surface_distance import SurfaceDistance
 from palpate.progress import Line, Progress, grouped
 from palpate.study.case import Case
 from palpate.study.case_loads import case_loads
@@ -49,6 +51,7 @@ from palpate.unknowns import (
     material_blocks,
     offset_block,
     parameter_map,
+    reference_block,
     unit_blocks,
     wall_blocks,
 )
@@ -175,14 +178,15 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
         raise ConfigurationError(NOTHING_MOVES)  # at rest every modulus explains the images equally badly
     strained = [body.strained for body in bodies for _ in range(body.states.n_later)]
     finite = _finite_strain(models, strained, case)
+    drawn = _drawn_at_rest(seen)
     states = tuple(
-        LaterState(model, observations, law, reference)
-        for model, law, (reference, observations) in zip(models, finite, seen, strict=True)
+        LaterState(model, observations, law, reference, at_rest={of.name: of.modes for of in drawn if s in of.states})
+        for s, (model, law, (reference, observations)) in enumerate(zip(models, finite, seen, strict=True))
     )
     parameters = parameter_map(
         models[0].space.mesh.tissues,
         models[0].regions,
-        _blocks(case, bodies[0], pairs, seen),
+        _blocks(case, bodies[0], pairs, seen, drawn),
         loaded=case.known_force,
         open_poisson=_open_poisson(case, bodies[0].space.mesh),
         dilatation=choose_element(case.mechanics.element).dilatation,
@@ -195,6 +199,7 @@ def _blocks(
     body: Body,
     pairs: Sequence[tuple[LinearModel, PrescribedMotion]],
     seen: Sequence[tuple[int, tuple[Observation, ...]]],
+    drawn: Sequence[_DrawnAtRest],
 ) -> tuple[Block, ...]:
     """All that is unknown beside the moduli: of each later state its motion and its drawing, then the material.
 
@@ -210,6 +215,7 @@ def _blocks(
         for o in observed:
             if isinstance(o, OfInstrument) and o.offset_sd:
                 blocks.append(instrument_block(o.name, s, sd=o.offset_sd))
+    blocks += [reference_block(of.name, of.states, of.covariances, unit_mm=UNIT_MM) for of in drawn]
     references = [reference for reference, _ in seen]
     for reference in dict.fromkeys(references):
         states = tuple(s for s, own in enumerate(references) if own == reference)
@@ -236,6 +242,29 @@ def _blocks(
         *(blocks or unit_blocks(*(0 for _ in pairs))),
         *known_modulus_blocks(pairs[0][0].space.mesh.tissues, regions, every),
         *layer_blocks(of, every, **believed),
+    )
+
+
+class _DrawnAtRest(NamedTuple):
+    """A surface of a reference image, which several later `states` are compared with: see `modes_at_rest`."""
+
+    name: str
+    states: tuple[int, ...]
+    modes: NDArray[np.float64]
+    covariances: tuple[NDArray[np.float64], ...]
+
+
+def _drawn_at_rest(seen: Sequence[tuple[int, tuple[Observation, ...]]]) -> tuple[_DrawnAtRest, ...]:
+    """Those of all references; of a single later image, and of a wall that moves freely, the noise says as much."""
+    found = dict[tuple[int, str], list[tuple[int, SurfaceDistance]]]()
+    for s, (reference, observed) in enumerate(seen):
+        for o in observed:
+            if isinstance(o, SurfaceDistance) and not o.of_driver:
+                found.setdefault((reference, o.name), []).append((s, o))
+    return tuple(
+        _DrawnAtRest(name, tuple(s for s, _ in of), *modes_at_rest(of[0][1].target.surface))
+        for (_, name), of in found.items()
+        if len(of) > 1
     )
 
 

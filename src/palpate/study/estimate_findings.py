@@ -102,7 +102,7 @@ def data_findings(inversion: Inversion) -> tuple[Finding, ...]:
         seen = line.observation
         if isinstance(seen, OfInstrument):
             names, offsets = mapping.offset_names(line.state), mapping.offsets(unknowns, line.state)
-            offset = dict(zip(names, offsets.tolist(), strict=True)).get(seen.name, 0.0)
+            offset = dict(zip(names, offsets.tolist(), strict=False)).get(seen.name, 0.0)
             alone = seen.measured + float(line.residuals.values[0]) - offset
             if alone * seen.measured < 0.0:
                 text = (

@@ -17,6 +17,7 @@ from palpate.unknowns.blocks import known_modulus_blocks as known_modulus_blocks
 from palpate.unknowns.blocks import layer_blocks as layer_blocks
 from palpate.unknowns.blocks import material_blocks as material_blocks
 from palpate.unknowns.blocks import offset_block as offset_block
+from palpate.unknowns.blocks import reference_block as reference_block
 from palpate.unknowns.blocks import unit_blocks as unit_blocks
 from palpate.unknowns.blocks import wall_blocks as wall_blocks
 from palpate.unknowns.parameters import ParameterMap as ParameterMap

@@ -29,7 +29,7 @@ STILL_RIGID, MOVED_RIGID = 0.005, 0.2
 DRAWN_ALIKE = 0.1  # standard deviation of an offset of surfaces drawn alike, over that of others
 SELDOM = 0.01  # odds of a surface that is drawn otherwise
 AMPLITUDES = (0.005, 2.0)  # bounds of those that are learned, times the standard deviation of the coefficients
-KNOWN_MODULUS, FRAME = "known modulus", "frame"
+KNOWN_MODULUS, FRAME, REFERENCE = "known modulus", "frame", "reference"
 FIELD, LAYER = "field", "layer"
 BONDED = 1e-4  # standard deviation of a layer that is like its tissue, over that of one that is not
 LEAST_VARIANCE = 1e-3  # of a motion's coefficient, in its unit, so that no mode is excluded
@@ -49,6 +49,7 @@ class Acts(Enum):
     MATERIAL = "the material of the elements"
     MODULI = "the logarithms of the moduli of regions"
     RESIDUALS = "the residuals of the observations, one unknown each"
+    REFERENCE = "the surfaces of the reference image, which all later images are compared with"
 
 
 class Choice(Enum):
@@ -236,6 +237,17 @@ def offset_block(observation: Observation, state: int, *, sd: float) -> Block:
         return Block(*own, only(variance), Choice.HELD)
     alike = Alternative(DRAWN_ALIKE**2 * variance, 0.0, "alike")
     return Block(*own, (alike, Alternative(variance, float(np.log(SELDOM)), "otherwise")), Choice.DRAWING)
+
+
+def reference_block(
+    name: str, states: tuple[int, ...], covariances: Sequence[NDArray[np.float64]], *, unit_mm: float
+) -> Block:
+    """How much further out a surface lies than the reference image draws it, alike for all later `states`.
+
+    covariances (n, n): of its modes, of several lengths; unit_mm: their standard deviation where an amplitude is 1.
+    """
+    own = name, REFERENCE, Acts.REFERENCE, states, only(np.asarray(sum(covariances)) / len(covariances))
+    return Block(*own, terms=tuple(covariances), unit_mm=unit_mm)
 
 
 def instrument_block(name: str, state: int, *, sd: float) -> Block:

@@ -287,20 +287,32 @@ class ParameterMap:
         return [unknowns[self._model_columns(state)] for state in range(self.n_states)]
 
     def offsets(self, unknowns: NDArray[np.float64], state: int) -> NDArray[np.float64]:
-        """What is added to the residuals of those observations of a state that have an offset (n_offsets,)."""
-        return np.asarray(unknowns[self.acting(Acts.RESIDUALS, state)])
+        """How surfaces are drawn otherwise (n_offsets,): offsets in a later image, then modes in the one at rest."""
+        return np.asarray(unknowns[self._drawing(state)])
 
     def offset_names(self, state: int) -> list[str]:
         """Names of the observations of a state that have an offset, in the order of these."""
         return [b.of for b in self.blocks if b.acts is Acts.RESIDUALS and state in b.states]
+
+    def at_rest(self, state: int) -> dict[str, slice]:
+        """Which of the `offsets` of a state are modes of a surface as the reference image draws it, by its name."""
+        first, found = len(self.acting(Acts.RESIDUALS, state)), dict[str, slice]()
+        for block in self.blocks:
+            if block.acts is Acts.REFERENCE and state in block.states:
+                found[block.of] = slice(first, first + block.size)
+                first += block.size
+        return found
+
+    def _drawing(self, state: int) -> NDArray[np.int64]:
+        return np.concatenate([self.acting(Acts.RESIDUALS, state), self.acting(Acts.REFERENCE, state)])
 
     def unknowns_of(self, state: int) -> NDArray[np.int64]:
         """Numbers (n_own,) of the unknowns that a state depends on.
 
         Theta, what else acts on moduli, its model's coefficients, its offsets.
         """
-        residuals, theta = self.acting(Acts.RESIDUALS, state), np.arange(self.n_parameters)
-        return np.concatenate([theta, self.acting_on_moduli, self._model_columns(state), residuals])
+        theta = np.arange(self.n_parameters)
+        return np.concatenate([theta, self.acting_on_moduli, self._model_columns(state), self._drawing(state)])
 
     def by_unknowns(self, tangent: NDArray[np.float64], unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives (n, k + n_modes) by what acts on moduli and the coefficients, from those by (ln E, q)."""
@@ -312,7 +324,7 @@ class ParameterMap:
 
         Its columns are those of `unknowns_of`, at unknowns (n_unknowns,).
         """
-        n_modes, n_offsets = len(self._model_columns(state)), len(self.acting(Acts.RESIDUALS, state))
+        n_modes, n_offsets = len(self._model_columns(state)), len(self._drawing(state))
         moved = linalg.block_diag(self.derivatives(unknowns), np.eye(n_modes))
         return np.pad(moved, ((0, 0), (0, n_offsets)))
 
