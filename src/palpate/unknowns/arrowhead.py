@@ -225,13 +225,12 @@ class Arrowhead:
 
         All others are eliminated. Raises `LinAlgError` where their matrix is not positive definite.
         """
-        kept = np.unique(self.places.split(numbers)[0][0]).tolist()
+        kept = {k for k, _, _ in self.places.split(numbers)}
         others = Places.of(self.size, (own for k, own in enumerate(self.places.images) if k not in kept))
-        near = [k for k in range(len(self.own)) if k in kept]
         matrix, right = self.block(others.shared, others.shared), rhs[others.shared]
         at = np.searchsorted(others.shared, self.places.shared)
         for k, (of_image, own, across) in enumerate(self._images()):
-            if k not in near:
+            if k not in kept:
                 factor = lower_factor(own)
                 border = forward(factor, across)
                 matrix[np.ix_(at, at)] -= border.T @ border
