@@ -65,13 +65,15 @@ class NoiseModel:
         def term(of: tuple[float, float]) -> NDArray[np.float64]:
             """That of one variance and its length."""
             variance, length = of
-            return variance * _correlated(*_carried(rows, places, normals, float(np.clip(SUMMED, 0.5 * length, length))), length)
+            return variance * _correlated(
+                *_carried(rows, places, normals, float(np.clip(SUMMED, 0.5 * length, length))), length
+            )
 
         return np.asarray(np.sum(mapped(term, zip(self.variances, self.lengths, strict=True)), axis=0))
 
 
 def mean_noise(models: Sequence[NoiseModel]) -> NoiseModel:
-    """The noise whose covariance is the mean of those of several models; terms of one length count, and cost, as one."""
+    """The noise whose covariance is the mean of those of several models; terms of one length are one."""
     lengths, which = np.unique(np.concatenate([model.lengths for model in models]), return_inverse=True)
     variances = np.concatenate([model.variances for model in models]) / len(models)
     return NoiseModel(np.bincount(which, variances), lengths)
