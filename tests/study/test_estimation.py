@@ -14,7 +14,7 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
 from palpate.study.estimation import Observed, conclude
 from palpate.study.samples import draw_moduli
-from palpate.study.stated_posterior import as_stated
+from palpate.study.stated_posterior import as_stated, profiled
 from palpate.study.verdicts import estimates_of, intervals_of, or_as_ratio, verdict
 from palpate.uncertainty import (
     FittedState,
@@ -451,7 +451,8 @@ def test_an_interval_that_could_not_be_followed_says_so_and_blames_no_bound(inve
     posterior = as_stated(inversion, covariance, settings.bounds)
     assert all(of.followed for of in intervals_of(inversion, settings, posterior))
     away = replace(minimum, unknowns=minimum.unknowns + 0.1)
-    known = intervals_of(inversion, settings, replace(posterior, frozen=Uphill(), minimum=away))
+    lost = profiled(replace(posterior, frozen=Uphill(), minimum=away), settings.bounds)
+    known = intervals_of(inversion, settings, lost)
     for found in estimates_of(inversion, known, covariance, truth={}):
         assert found.verdict == "not identified"
         assert found.interval95 is None

@@ -10,7 +10,7 @@ import pytest
 from palpate.approximation import exact_approximation, reduced_basis
 from palpate.inversion import Outcome, frozen_posterior, invert
 from palpate.observation.noise_model import NoiseModel
-from palpate.study.stated_posterior import StatedPosterior, exact_at_ends
+from palpate.study.stated_posterior import StatedPosterior, exact_at_ends, profiled
 from palpate.uncertainty import NORMAL_95, Covariance, StatedMixture, modulus_interval
 
 NOISE = NoiseModel(np.array([0.3**2]), np.array([3.0]))
@@ -77,7 +77,7 @@ def test_profiles_end_where_those_of_the_full_model_do(inversion, poor, on_poor,
     Of an expansion lower ends alone: its own derivatives lead nearly as far upwards.
     """
     before = posterior_of(on_poor, inversion.minimum)
-    found, full = exact_at_ends(before, on_poor, bounds), poor
+    found, full = exact_at_ends(profiled(before, bounds), on_poor, bounds), poor
     for of in profiles(found, bounds):
         for place in of.outermost:
             at, (model,) = full.linearisation_points(place)[0], full.approximations

@@ -382,22 +382,23 @@ def of_same_body(
     return next((other.of(model) for other in same), None)
 
 
-def poisson_tangents(equilibrium: LinearEquilibrium, dilatation: Dilatation) -> NDArray[np.float64]:
-    """Columns du / d nu_r = -F K_ff^-1 F^T E_r dK_r/dnu u (n_dof, n_regions) mm, one for each tissue.
+def poisson_tangents(system: LinearSystem, values: NDArray[np.float64], dilatation: Dilatation) -> NDArray[np.float64]:
+    """Columns du / d nu_r = -F K_ff^-1 F^T E_r dK_r/dnu u (k, n_dof, n_regions) mm of equilibria u (n_dof, k) mm.
 
-    dilatation: that with which the model was made. The tissues' Poisson's ratios are closed.
+    One column for each tissue. Equilibria of a body at one system's moduli, under whatever is prescribed; dilatation:
+    that with which the model was made. The tissues' Poisson's ratios are closed.
     """
-    system, model = equilibrium.system, equilibrium.system.model
-    tissues, free = model.space.mesh.tissues, model.constraint.free
+    model, free, tissues = system.model, system.model.constraint.free, system.model.space.mesh.tissues
 
-    def force(of: tuple[float, int]) -> NDArray[np.float64]:
-        """E_r F^T dK_r/dnu u (n_free,), mN, of one region."""
+    def forces(of: tuple[float, int]) -> NDArray[np.float64]:
+        """E_r F^T dK_r/dnu u (n_free, k), mN, of one region."""
         modulus, region = of
         by_poisson = stiffness_by_poisson(model.space, region, tissues[region].poisson_ratio, dilatation=dilatation)
-        return np.asarray(free.T @ (modulus * (by_poisson @ equilibrium.values)))
+        return np.asarray(free.T @ (modulus * (by_poisson @ values)))
 
-    forces = mapped(force, zip(system.moduli.tolist(), model.regions, strict=True))
-    return np.asarray(free @ system.factorisation.solve(-np.stack(forces, axis=1)))
+    every = mapped(forces, zip(system.moduli.tolist(), model.regions, strict=True))
+    moved = np.asarray(free @ system.factorisation.solve(-np.concatenate(every, axis=1)))
+    return np.moveaxis(moved.reshape(len(moved), len(every), -1), 2, 0)
 
 
 def linear_model(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +17,17 @@ from palpate.observation.jacobian import Jacobian
 from palpate.parallel import mapped
 
 LENGTHS = (0.5, 0.8, 1.2, 2.0, 3.0, 4.5, 6.5, 9.5, 14.0)  # mm
-CELL, FAR_CELL = 1.0, 3.0  # mm, edges of the cells over which residuals are averaged before pairs are compared
+CELL = 1.0  # mm, edge of the cells over which residuals are averaged before pairs are compared
+PAIRS = ((0, CELL), (3, 2.0), (9, 4.0))  # mm: distances from which pairs are of cells with such edges
 CELLS = 2**20  # along an axis, after which cells are counted from 0 again
-NEAR, REACH = 8, 28  # mm: pairs beyond the first distance are of large cells, pairs beyond the second are left out
+REACH = 28  # mm: pairs beyond are left out
 BINS = 1 + REACH  # one for a cell with itself, then one for each mm
 FLOOR = 1e-3  # mm, the least standard deviation of a surface in an image
 SMOOTH = 4.0  # mm: the fit hardly mistakes errors with shorter correlation for motion
 CUTOFF = 3.5  # correlation lengths beyond which errors count as independent
-WITHIN = 0.75  # correlation lengths, edge of the cells in which errors are summed for the fit's response
-RESPONSE_CELLS = 800  # largest number of a surface's cells for which the fit's response is computed
+WITHIN = 1.0  # correlation lengths, edge of the cells in which errors are summed for the fit's response
+SUMMED = 2.0  # mm, edge of the cells in which errors are summed for a covariance
+RESPONSE_CELLS = 400  # largest number of a surface's cells for which the fit's response is computed
 NEIGHBOURS = 12
 AT_ONCE = 256  # means whose neighbours' distances are computed together: some 40 MB
 GROWTH = 1.15  # of the number of points from one block to the next
@@ -52,34 +54,29 @@ class NoiseModel:
         """Area that one independent residual stands for, mm^2: integral of C over a plane, by C(0)."""
         return float(2.0 * np.pi * (self.variances @ self.lengths**2) / self.variances.sum())
 
-    @property
-    def key(self) -> tuple[float, ...]:
-        """Its numbers, by which two are the same."""
-        return (*self.variances.tolist(), *self.lengths.tolist())
-
     def covariance(
         self, rows: NDArray[np.float64], places: NDArray[np.float64], normals: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """A C A^T (n_rows, n_rows) for A = `rows` (n_rows, n) on residuals at places and normals (n, 3).
 
-        Residuals within half a correlation length are summed first.
+        Residuals are summed first in cells of 2 mm, but of half a correlation length at the least, of one at the most.
         """
 
         def term(of: tuple[float, float]) -> NDArray[np.float64]:
             """That of one variance and its length."""
             variance, length = of
-            return variance * _correlated(*_carried(rows, places, normals, 0.5 * length), length)
+            return variance * _correlated(
+                *_carried(rows, places, normals, float(np.clip(SUMMED, 0.5 * length, length))), length
+            )
 
         return np.asarray(np.sum(mapped(term, zip(self.variances, self.lengths, strict=True)), axis=0))
 
 
 def mean_noise(models: Sequence[NoiseModel]) -> NoiseModel:
-    """The noise whose covariance is the mean of those of several models; equal ones count, and cost, as one."""
-    distinct = {model.key: model for model in models}
-    counts = Counter(model.key for model in models)
-    shares = [counts[key] / len(models) for key in distinct]
-    variances = [share * model.variances for share, model in zip(shares, distinct.values(), strict=True)]
-    return NoiseModel(np.concatenate(variances), np.concatenate([model.lengths for model in distinct.values()]))
+    """The noise whose covariance is the mean of those of several models; terms of one length are one."""
+    lengths, which = np.unique(np.concatenate([model.lengths for model in models]), return_inverse=True)
+    variances = np.concatenate([model.variances for model in models]) / len(models)
+    return NoiseModel(np.bincount(which, variances).astype(np.float64), lengths)
 
 
 EXACT_NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))  # of surfaces that no image has rounded
@@ -203,15 +200,16 @@ def _binned_products(
 ) -> NDArray[np.float64]:
     """Sums (4, n_bins) over pairs of cells, those of a cell with itself first: r_i r_j n_i.n_j, (n_i.n_j)^2, mm, 1.
 
-    A cell holds the means of its residuals, places and normals. Pairs less than 8 mm apart are of cells of 1 mm. Others
-    are of cells of 3 mm, because 3 mm hardly change their distance; each counts as many times as it has cells of 1 mm.
+    A cell holds the means of its residuals, places and normals. The further apart pairs are, the larger the cells may
+    be, because these change their distance less (see `PAIRS`); each counts as many times as it has cells of 1 mm.
     """
-    cells = _cell_means(places, CELL)
-    mean, centre, normal = _times(cells, values), _times(cells, places), _units(_times(cells, normals))
-    near = _pair_sums(mean, centre, normal, np.ones(len(mean)), (0, NEAR))
-    cells, count = _cell_means(centre, FAR_CELL), np.bincount(_cell_keys(centre, FAR_CELL)[1])
-    far = _times(cells, mean), _times(cells, centre), _units(_times(cells, normal))
-    sums = near + _pair_sums(*far, count.astype(np.float64), (NEAR, REACH))
+    small = _cell_means(places, CELL)
+    mean, centres, units = _times(small, values), _times(small, places), _units(_times(small, normals))
+    sums = np.zeros((4, BINS))
+    for (first, size), (last, _) in pairwise((*PAIRS, (REACH, CELL))):
+        cells, count = _cell_means(centres, size), np.bincount(_cell_keys(centres, size)[1]).astype(np.float64)
+        of = _times(cells, mean), _times(cells, centres), _units(_times(cells, units))
+        sums += _pair_sums(*of, count, (first, last))
     sums[:, 0] = mean @ mean, len(mean), 0.0, len(mean)
     return sums
 

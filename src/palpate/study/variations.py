@@ -157,8 +157,8 @@ def what_would_change(
     ]
 
     changes: list[tuple[tuple[str, str, str], Callable[[], Shift]]] = [
-        ((each.cause, each.subject, words), partial(path.shift, tuple(amount * error for error in each.errors)))
-        for each in inputs
+        ((each.cause, each.subject, words), partial(path.shift, pulled(amount)))
+        for each, pulled in zip(inputs, mapped(lambda each: path.pulled(each.errors), inputs), strict=True)
         for amount, words in each.amounts
     ]
     frame = np.concatenate([np.zeros(0, dtype=bool), *(np.full(b.size, b.cause == "frame") for b in blocks)])
@@ -167,7 +167,7 @@ def what_would_change(
 
     def under(law: Law) -> Callable[[], Shift]:
         """What a step to another law's equilibrium does."""
-        return lambda: path.shift(law_errors(minimum.evaluation, equilibria, law, dilatation))
+        return lambda: path.shift(path.pulled(law_errors(minimum.evaluation, equilibria, law, dilatation))(1.0))
 
     bound = inversion.objective.parameters.poisson or any(
         isinstance(o, OfMaterial) for o in inversion.objective.observations

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from palpate.inversion import Inversion, InversionSettings
-from palpate.parallel import mapped
 from palpate.study.estimated import ModulusEstimate, no_estimate
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
 from palpate.study.stated_posterior import StatedPosterior
@@ -20,7 +19,6 @@ from palpate.uncertainty import (
     ModulusInterval,
     log_interval,
     marginals_of,
-    modulus_interval,
 )
 from palpate.unknowns import KNOWN_MODULUS, ratio_of_eta
 
@@ -68,15 +66,9 @@ def intervals_of(inversion: Inversion, settings: InversionSettings, posterior: S
     """Of each parameter its quantiles over all explanations; none where nothing converged."""
     if not inversion.minimum.converged:
         return ()
-    n, bounds, variances = inversion.objective.n_parameters, settings.bounds, np.diag(posterior.covariance)
-    at_bound = bounds.reached(posterior.minimum.unknowns[:n])
-
-    def of_one(number: int) -> ModulusInterval:
-        """That of one parameter by the likeliest explanation."""
-        variance = float(variances[number])
-        return modulus_interval(posterior.frozen, posterior.minimum, number, variance=variance, bounds=bounds)
-
-    every = mapped(of_one, range(n))
+    bounds = settings.bounds
+    at_bound = bounds.reached(posterior.minimum.unknowns[: inversion.objective.n_parameters])
+    every = posterior.intervals
     marginals, found = marginals_of(posterior.mixture, every), list[Known]()
     for i, (own, marginal) in enumerate(zip(every, marginals, strict=True)):
         ends = float(bounds.lower[i]), float(bounds.upper[i])

@@ -105,22 +105,25 @@ def covariance_of(
     wrong moduli leave.
     """
     noise_of = error_noise(evaluation) if noise_of is None else noise_of
-    mesh = mesh_covariance(objective)
-    given = _given_model(objective, evaluation)
+    n, mesh, given = objective.n_parameters, mesh_covariance(objective), _given_model(objective, evaluation)
+    both = (evaluation,) if given is evaluation else (evaluation, given)
+    gains = [np.concatenate(rows) for rows in zip(*(gain(of, n) for of in both), strict=True)]
+    by_noise = noise_covariance(objective, list(zip(evaluation.linearisations, gains, strict=True)), noise_of)
 
-    def parts(of: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def parts(i: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Covariances by noise, prior and grid of one set of unknowns."""
-        noise, prior = _sandwich(objective, of, of.covariance_columns(objective.n_parameters).T, noise_of)
+        own, rows = slice(i * n, (i + 1) * n), both[i].covariance_columns(n).T
+        noise, prior = by_noise[own, own], np.asarray(rows @ (both[i].prior @ rows.T))
         if not errors:
             return noise, prior, np.zeros_like(noise)
-        return noise, prior, grid_covariance(evaluation, scatter(shifts_by(of, errors, objective.n_parameters)), noise)
+        shifts = shifts_by([rows[own] for rows in gains], errors)
+        return noise, prior, grid_covariance(evaluation, scatter(shifts), noise)
 
-    noise, prior, grid = parts(evaluation)
-    rows = evaluation.covariance_columns(objective.n_parameters).T
-    held = _held(objective, evaluation, rows)
+    noise, prior, grid = parts(0)
+    inverse = evaluation.covariance_columns(n)
+    held = _held(objective, evaluation, inverse.T)
     causes, prior = dict(held), prior + sum(held.values(), np.zeros_like(prior))
-    left = noise + prior + grid if given is evaluation else sum(parts(given), np.zeros_like(noise))
-    inverse = rows.T
+    left = noise + prior + grid if given is evaluation else sum(parts(1), np.zeros_like(noise))
     for i, block in enumerate(objective.parameters.blocks):
         own = objective.parameters.columns(i)
         part = inverse[own].T @ evaluation.prior.block(own, own) @ inverse[own]
@@ -229,10 +232,10 @@ def noise_covariance(
 ) -> NDArray[np.float64]:
     """G C G^T (n, n) by the residuals' errors, of observations with their gains G (n, n_residuals), 1/mm.
 
-    See `sandwich_covariance`.
+    See `sandwich_covariance`. Half of the errors are the rest image's, or none where its drawing is an unknown.
     """
     n = len(pairs[0][1])
-    data = np.zeros((n, n))
+    data, at_rest_of = np.zeros((n, n)), [objective.parameters.at_rest(s) for s in range(len(objective.states))]
     for kind in dict.fromkeys(term.observation.kind for term, _ in pairs):
         of_kind = [(term, row) for term, row in pairs if term.observation.kind == kind]
         later = [term.state for term, _ in of_kind]
@@ -240,10 +243,16 @@ def noise_covariance(
             for key in dict.fromkeys(groups):
                 group = [pair for pair, own in zip(of_kind, groups, strict=True) if own == key]
                 noise = mean_noise([noise_of[term.state, kind] for term, _ in group])
-                carried = np.concatenate([row for _, row in group], axis=1)
+                told = [bool(of := at_rest_of[term.state]) and term.observation.name in of for term, _ in group]
+                parts = [0.5 if not known else 0.0 if at_rest else 1.0 for known in told]
+                carried = np.concatenate(
+                    [np.sqrt(part) * row for part, (_, row) in zip(parts, group, strict=True)], axis=1
+                )
                 residuals = [term.residuals for term, _ in group]
                 places = np.concatenate([r.material if at_rest else r.places for r in residuals])
-                data += 0.5 * noise.covariance(carried, places, np.concatenate([r.normals for r in residuals]))
+                moved = np.flatnonzero(carried.any(axis=1))  # the others are estimates from other images
+                normals = np.concatenate([r.normals for r in residuals])
+                data[np.ix_(moved, moved)] += noise.covariance(carried[moved], places, normals)
     return data
 
 
@@ -253,20 +262,16 @@ def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
     The residuals at a minimum are what the fit left of them: see `FitResponse`. What errors of one later image do to
     the residuals of another, by the moduli alone, is neglected.
     """
-    linearisations, n, found = evaluation.linearisations, evaluation.matrix.size, {}
-    inverse = evaluation.covariance_columns(n)
+    linearisations, found = evaluation.linearisations, {}
+    inverse = evaluation.covariance_columns(evaluation.matrix.size)
     for key, (own, telling) in of_one_noise(evaluation).items():
-        jacobians, gains = list[Jacobian](), list[Jacobian]()
-        for term in (linearisations[i] for i in telling):
-            tangent = np.zeros((len(term.jacobian.tangent), n))
-            tangent[:, term.columns] = term.jacobian.tangent
-            jacobians.append(replace(term.jacobian, tangent=tangent))
+        gains, columns = list[Jacobian](), linearisations[own[0]].columns
         for term in (linearisations[i] for i in own):  # W J H^-1, its part of the gain's transpose
             weights = sparse.diags_array(term.precision * term.weights)
             seen = sparse.csr_matrix(weights @ term.jacobian.by_displacement)
-            gains.append(Jacobian(seen, term.jacobian.tangent @ inverse[term.columns]))
+            gains.append(Jacobian(seen, term.jacobian.tangent @ inverse[np.ix_(columns, columns)]))
         response = FitResponse(
-            jacobians,
+            [linearisations[i].jacobian for i in telling],
             gains,
             places=[linearisations[i].residuals.material for i in own],
             normals=[linearisations[i].residuals.normals for i in own],
@@ -290,7 +295,7 @@ def grid_position_shifts(
     The errors e of the residuals (see `grid_errors`) go through the gain of one Gauss-Newton step, -G e.
     """
     errors = grid_errors(objective, evaluation, states, draws=draws, rng=rng)
-    return shifts_by(evaluation, errors, objective.n_parameters)
+    return shifts_by(gain(evaluation, objective.n_parameters), errors)
 
 
 def grid_errors(
@@ -338,11 +343,13 @@ def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
 
 
-def shifts_by(evaluation: Evaluation, errors: GridErrors, n_parameters: int) -> NDArray[np.float64]:
-    """Shifts -G e (draws, n_parameters) of the log-moduli by errors e (n,) mm of each surface, of each draw."""
-    rows = gain(evaluation, n_parameters)
-    moved = [-sum((row @ e for row, e in zip(rows, of, strict=True)), np.zeros(n_parameters)) for of in errors]
-    return np.asarray(moved).reshape(len(moved), n_parameters)
+def shifts_by(gains: Sequence[NDArray[np.float64]], errors: GridErrors) -> NDArray[np.float64]:
+    """Shifts -G e (draws, n) of the log-moduli by errors e (n_residuals,) mm of each surface, of each draw.
+
+    gains: G (n, n_residuals) of each surface, 1/mm.
+    """
+    moved = [-sum((row @ e for row, e in zip(gains, of, strict=True)), np.zeros(len(gains[0]))) for of in errors]
+    return np.asarray(moved).reshape(len(moved), len(gains[0]))
 
 
 def imaging_errors(

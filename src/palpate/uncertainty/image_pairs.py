@@ -88,7 +88,7 @@ def pair_estimates(objective: Objective, minimum: Minimum, bounds: Bounds, error
         of_data = evaluation.matrix - evaluation.prior
         held[mapping.alone(s)[1], s * n : (s + 1) * n] = of_data @ evaluation.covariance_columns(n)
         seen = [i for i, state in enumerate(states) if state == s]
-        shifts.append(shifts_by(evaluation, [[draw[i] for i in seen] for draw in errors], n))
+        shifts.append(shifts_by(gain(evaluation, n), [[draw[i] for i in seen] for draw in errors]))
         of_mesh = mesh_covariance(replace(objective, states=(objective.states[s],)))
         for t in range(n_pairs):
             mesh[s, :, t] += of_mesh if references[s] == references[t] else 0.0

@@ -8,8 +8,9 @@ foretells. The drivers' prior and their modes are changed under the estimate's o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,26 +19,30 @@ from palpate.approximation.expansion import Expansion
 from palpate.inversion import (
     Bounds,
     Evaluation,
-    FixedCorrespondence,
-    Linearisation,
+    FrozenPosterior,
     Minimum,
     Objective,
-    fixed_correspondence,
+    Posterior,
+    cheapest_posterior,
+    frozen_posterior,
     gauss_newton,
 )
 from palpate.mechanics.dilatation import Dilatation
-from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, finite_strain_model
+from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel, finite_strain_model
 from palpate.mechanics.hyperelastic import elements_of
 from palpate.mechanics.laws.contract import Law
-from palpate.mechanics.linear_model import LinearEquilibrium, LinearSystem, of_same_body, poisson_tangents
+from palpate.mechanics.linear_model import LinearEquilibrium, LinearModel, LinearSystem, poisson_tangents
 from palpate.mechanics.newton import NewtonSettings
+from palpate.mechanics.solvers.conjugate_gradients import conjugate_gradients
+from palpate.mechanics.solvers.contract import Factorisation
 from palpate.observation.contract import Imaged, OfMaterial, seen_by
 from palpate.uncertainty.profile import PASSES, refitted
 
 TOLERANCE = 1e-6  # decrement of a minimum
 STEPS = 120  # at the most, for a modulus that moves far
-COARSE = NewtonSettings(tolerance=2e-3, step_tolerance=1e-2)  # of the forces, under another law
+COARSE = NewtonSettings(tolerance=2e-2, step_tolerance=2e-2)  # of the forces, under another law
 DERIVATIVES = 1e-4  # relative residual of those by Poisson's ratios
+ITERATIONS = 120  # with a factorisation of other moduli
 DROPPED = 1e10  # precision of a coefficient that is held at 0; a free one has 1
 
 Errors = tuple[NDArray[np.float64], ...]  # changes (n,) mm of each observation's residuals
@@ -58,9 +63,11 @@ class Shift:
 
 @dataclass(frozen=True, slots=True)
 class FastPath:
-    """The objective with closest points and weights held, its minimum near the estimate, and the search's bounds."""
+    """An objective with closest points and weights held as at a `minimum`, its `least` near there, and the bounds."""
 
-    fixed: FixedCorrespondence
+    objective: Objective
+    minimum: Minimum
+    posterior: Posterior
     least: Minimum
     bounds: Bounds
 
@@ -69,68 +76,97 @@ class FastPath:
 
         passes: see `refitted`, which also tells what is raised.
         """
-        there = _moved(self.least.evaluation.linearisations, errors)
-        moved = replace(self.least, evaluation=replace(self.least.evaluation, linearisations=there))
-        return self._shift(refitted(self.fixed.objective, moved, self.bounds, max_steps=STEPS, passes=passes)[0])
+        moved = replace(self.minimum, evaluation=_moved(self.minimum.evaluation, errors))
+        return self._shift(refitted(self.objective, moved, self.bounds, max_steps=STEPS, passes=passes)[0])
 
-    def shift(self, errors: Errors = (), *, width: float = 1.0, dropped: NDArray[np.bool_] | None = None) -> Shift:
-        """Where it goes under its own weights: with other residuals, another prior of the drivers, fewer modes.
-
-        errors: e (n,) mm of each observation, none for none; width: of the prior, times its own; dropped
-        (n_coefficients,): coefficients that are held at 0. Raises `SolverError`, `EstimationError` where an unknown is
-        left open.
-        """
-        fixed, start, n = self.fixed, self.least.unknowns.copy(), self.fixed.n_parameters
-        parameters = fixed.objective.parameters
-        priors = list(parameters.priors)
-        for i, block in enumerate(parameters.blocks):
-            covariance = (width if block.cause == "driver" else 1.0) ** 2 * priors[i].covariance
-            if dropped is not None:
-                held = DROPPED * np.diag(dropped[parameters.columns(i) - n])
-                covariance = np.asarray(np.linalg.inv(np.linalg.inv(covariance) + held))
-            priors[i] = replace(priors[i], covariance=covariance)
-        if dropped is not None:
-            start[n:] = np.where(dropped, 0.0, start[n:])
-        objective = replace(fixed.objective, parameters=replace(parameters, priors=tuple(priors)))
-        linearisations, there = fixed.linearisations, self.least.evaluation.linearisations
-        if errors:
-            linearisations, there = _moved(linearisations, errors), _moved(there, errors)
-        changed = replace(fixed, objective=objective, linearisations=linearisations)
-        begin = changed.assembled(start, there) if dropped is None else None
-        return self._shift(
-            gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE, max_steps=STEPS, begin=begin)
+    def pulled(self, errors: Errors) -> Callable[[float], Posterior]:
+        """The posterior by its amount, whose residuals change by that many times e (n,) mm, of each observation."""
+        at, evaluation, held = self.minimum.unknowns, self.minimum.evaluation, self.posterior
+        if not isinstance(held, FrozenPosterior):
+            return lambda amount: cheapest_posterior(
+                self.objective, at, _moved(evaluation, tuple(amount * error for error in errors))
+            )
+        ends = frozen_posterior(self.objective, at, _moved(evaluation, errors)).states
+        ways = [(state, end.form - state.form) for state, end in zip(held.states, ends, strict=True)]
+        return lambda amount: replace(
+            held, states=tuple(replace(state, form=state.form + amount * way) for state, way in ways)
         )
 
+    def shift(
+        self, posterior: Posterior | None = None, *, width: float = 1.0, dropped: NDArray[np.bool_] | None = None
+    ) -> Shift:
+        """Where it goes under its own weights: with other residuals, another prior of the drivers, fewer modes.
+
+        posterior: one that is `pulled`; width: of the prior, times its own; dropped (n_coefficients,): coefficients
+        that are held at 0. Raises `SolverError`, `EstimationError` where an unknown is left open.
+        """
+        start, n, changed = self.least.unknowns.copy(), self.objective.n_parameters, posterior or self.posterior
+        parameters = self.objective.parameters
+        if width != 1.0 or dropped is not None:
+            priors = list(parameters.priors)
+            for i, block in enumerate(parameters.blocks):
+                covariance = (width if block.cause == "driver" else 1.0) ** 2 * priors[i].covariance
+                if dropped is not None:
+                    held = DROPPED * np.diag(dropped[parameters.columns(i) - n])
+                    covariance = np.asarray(np.linalg.inv(np.linalg.inv(covariance) + held))
+                priors[i] = replace(priors[i], covariance=covariance)
+            if dropped is not None:
+                start[n:] = np.where(dropped, 0.0, start[n:])
+            changed = changed.believing(replace(parameters, priors=tuple(priors)))
+        return self._shift(gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE, max_steps=STEPS))
+
     def _shift(self, found: Minimum) -> Shift:
-        theta, least = (of.unknowns[: self.fixed.n_parameters] for of in (found, self.least))
+        theta, least = (of.unknowns[: self.objective.n_parameters] for of in (found, self.least))
         return Shift(theta - least, self.bounds.reached(theta), found.converged)
 
 
-def _moved(linearisations: Sequence[Linearisation], errors: Errors) -> tuple[Linearisation, ...]:
-    """Linearisations with their residuals changed."""
-    return tuple(term.with_errors(error) for term, error in zip(linearisations, errors, strict=True))
+def _moved(evaluation: Evaluation, errors: Errors) -> Evaluation:
+    """An evaluation with its residuals changed; of value and score nothing is said."""
+    pairs = zip(evaluation.linearisations, errors, strict=True)
+    return replace(evaluation, linearisations=tuple(term.with_errors(error) for term, error in pairs))
 
 
 def fast_path(objective: Objective, minimum: Minimum, bounds: Bounds) -> FastPath:
     """That of an estimate; raises as `gauss_newton` does."""
-    fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
-    return FastPath(fixed, gauss_newton(fixed, minimum.unknowns, bounds=bounds, tolerance=TOLERANCE), bounds)
+    posterior = cheapest_posterior(objective, minimum.unknowns, minimum.evaluation)
+    least = gauss_newton(posterior, minimum.unknowns, bounds=bounds, tolerance=TOLERANCE)
+    return FastPath(objective, minimum, posterior, least, bounds)
+
+
+@dataclass(frozen=True, slots=True)
+class _Nearby:
+    """The stiffness of a model at moduli (n_regions,) kPa, by iterations with a factorisation of others'."""
+
+    model: LinearModel
+    moduli: NDArray[np.float64]
+    inner: Factorisation
+
+    def solve(self, rhs: NDArray[np.float64], *, tolerance: float = DERIVATIVES) -> NDArray[np.float64]:
+        """Solution (n, m) for rhs (n, m) to a relative residual of `tolerance`, or of `DERIVATIVES` if that is less."""
+        product, accuracy = partial(self.model.free_forces, self.moduli), max(tolerance, DERIVATIVES)
+        return conjugate_gradients(product, rhs, self.nearly, tolerance=accuracy, max_iterations=ITERATIONS)[0]
+
+    def nearly(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the factorisation alone makes of rhs (n, m)."""
+        return self.inner.nearly(rhs)
 
 
 def exact_equilibria(objective: Objective, unknowns: NDArray[np.float64]) -> Equilibria:
-    """The equilibrium of each later state at unknowns (n_unknowns,), with its factorisation; raises `SolverError`.
+    """The equilibrium of each later state at unknowns (n_unknowns,), where its approximation is exact.
 
-    States of one body share a factorisation under the linear law.
+    Derivatives are taken with the factorisation that is there; raises `SolverError`.
     """
-    found, systems = list[LinearEquilibrium | FiniteStrainEquilibrium](), list[LinearSystem]()
+    found = list[LinearEquilibrium | FiniteStrainEquilibrium]()
     points = objective.linearisation_points(unknowns)
     for state, of, place in zip(objective.states, objective.approximations, points, strict=True):
         if isinstance(of, Expansion):
             found.append(of.equilibrium)
-            continue
-        shared = of_same_body(state.model, place.moduli, systems)
-        systems.append(shared or state.model.system(place.moduli))
-        found.append(systems[-1].solve(place.coefficients))
+        elif of.factorisation is None:
+            found.append(state.model.solve(place.moduli, place.coefficients))
+        else:
+            near = _Nearby(state.model, place.moduli, of.factorisation)
+            values = of.model.solve(place.moduli, place.coefficients).values
+            found.append(LinearEquilibrium(LinearSystem(state.model, place.moduli, near), place.coefficients, values))
     return tuple(found)
 
 
@@ -144,14 +180,23 @@ def poisson_errors(
     At the equilibria of the later states, held moduli and coefficients; dilatation: that of the element. In the
     residuals' unit of what depends on the material directly, as a force does.
     """
-    tangents = [
-        there.poisson_tangents(tolerance=DERIVATIVES)
-        if isinstance(there, FiniteStrainEquilibrium)
-        else poisson_tangents(there, dilatation)
-        for there in equilibria
-    ]
+    tangents, linear = dict[int, NDArray[np.float64]](), dict[int, LinearEquilibrium]()
+    for s, there in enumerate(equilibria):
+        if isinstance(there, FiniteStrainEquilibrium):
+            tangents[s] = there.poisson_tangents(tolerance=DERIVATIVES)
+        else:
+            linear[s] = there
+    while linear:  # later images of one body together
+        first = next(iter(linear.values())).system
+        alike = [s for s, there in linear.items() if first.model.same_stiffness(there.system.model)]
+        values = np.stack([linear.pop(s).values for s in alike], axis=1)
+        tangents |= zip(alike, poisson_tangents(first, values, dilatation), strict=True)
     found = []
-    for term, moved in zip(evaluation.linearisations, _of_displacements(evaluation, tangents), strict=True):
+    for term, moved in zip(
+        evaluation.linearisations,
+        _of_displacements(evaluation, [tangents[s] for s in range(len(equilibria))]),
+        strict=True,
+    ):
         seen, there = term.observation, equilibria[term.state]
         if not isinstance(seen, OfMaterial):
             found.append(moved)
@@ -173,7 +218,7 @@ def law_errors(
     Newton's method leads from each equilibrium to that of the other law, with the factorisation that is there. Raises
     `NotConverged` where there is none.
     """
-    changes = []
+    changes, made = list[NDArray[np.float64]](), dict[int, FiniteStrainModel]()
     for there in equilibria:
         if isinstance(there, FiniteStrainEquilibrium):
             exact = there if there.factorisation else there.refactorised()
@@ -181,14 +226,9 @@ def law_errors(
             moduli, factorisation = exact.moduli, exact.factorisation
         else:
             model, moduli, factorisation = there.system.model, there.system.moduli, there.system.factorisation
-            other = finite_strain_model(
-                model.space,
-                model.constraint,
-                law,
-                dilatation=dilatation,
-                loads=model.conditions.loads,
-                material=model.material,
-            )
+            if id(model.space) not in made:  # later images of one body differ in what is prescribed
+                made[id(model.space)] = finite_strain_model(model.space, model.constraint, law, dilatation=dilatation)
+            other = replace(made[id(model.space)].under(model.conditions), material=model.material)
         coarse = replace(other, settings=COARSE)
         found = coarse.solve(moduli, there.coefficients, start=there.displacement, nearby=factorisation)
         changes.append(np.asarray(found.values - there.values))
