@@ -76,7 +76,7 @@ def mean_noise(models: Sequence[NoiseModel]) -> NoiseModel:
     """The noise whose covariance is the mean of those of several models; terms of one length are one."""
     lengths, which = np.unique(np.concatenate([model.lengths for model in models]), return_inverse=True)
     variances = np.concatenate([model.variances for model in models]) / len(models)
-    return NoiseModel(np.bincount(which, variances).astype(np.float64), lengths)
+    return NoiseModel(np.asarray(np.bincount(which, variances), dtype=np.float64), lengths)
 
 
 EXACT_NOISE = NoiseModel(np.array([0.03**2]), np.array([3.0]))  # of surfaces that no image has rounded
