@@ -29,7 +29,6 @@ NEAR = 1e-3  # decrement of a minimum on linear residuals
 HALVINGS = 5  # of a step that leads to a state which cannot be solved, or to a worse fit
 WORSE = 2.0  # rise of J at which a step is halved: closest points that slide over voxels make less
 FLOOR = 1e-4  # of ln E: a move that is always short enough
-MEMORY, DEPENDENT = 2, 1e-2  # earlier iterations that count; relative size of ways that count as dependent
 CALM = 0.4  # of ln of the residuals' scale: a change with which the noise still follows the search
 
 
@@ -54,7 +53,7 @@ class Searched:
 
     The evaluation is that under the likeliest explanation. mixture: None before the first iteration. settled: whether
     the noise is fitted, after which the objective stays as it is. moved: by how many of its standard deviations the
-    mean moved last; led: theta (n_parameters,) of the last iterations, and the mean (n_parameters,) found from each.
+    mean moved last.
     """
 
     objective: Objective
@@ -62,7 +61,6 @@ class Searched:
     mixture: Mixture | None = None
     settled: bool = False
     moved: float = np.inf
-    led: tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...] = ()
 
     @property
     def posterior(self) -> Mixture:
@@ -149,10 +147,9 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         evaluation = evaluation.under(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
         return replace(now, objective=objective, minimum=minimum, mixture=mixture, moved=moved, settled=True)
-    led = (*now.led[-MEMORY:], (theta, mixture.mean))
-    target = _target(posterior, objective, mixture, np.clip(_fixed_point(led, sd), near.lower, near.upper))
+    target = _target(posterior, objective, mixture, np.clip(mixture.mean, near.lower, near.upper))
     settled = now.settled or (exact and _calm(now.objective, objective))
-    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled, led=led)
+    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled)
     return _taken(before, evaluation, target)
 
 
@@ -160,24 +157,6 @@ def _calm(before: Objective, objective: Objective) -> bool:
     """Whether the noise of no observation changed much: far away it may be so large that every move is short."""
     was, now = (np.log([o.weighting.sd for o in of.observations]) for of in (before, objective))
     return bool(np.all(np.abs(now - was) < CALM))
-
-
-def _fixed_point(
-    led: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], sd: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Theta (n_parameters,) from which the mean should lead nowhere, by where the last iterations led.
-
-    Anderson's acceleration (Walker & Ni, SIAM J. Numer. Anal. 49 (2011) 1715) in standard deviations (n_parameters,):
-    without it a search goes to and fro where the responses to patchy tissues depend much on the moduli.
-    """
-    scale = np.where(np.isfinite(sd), sd, 1.0)  # a modulus that moves nothing has none
-    places, means = (np.stack(each) / scale for each in zip(*led, strict=True))
-    ways = means - places
-    if len(led) == 1:
-        return np.asarray(means[-1] * scale)
-    by_places, by_ways = np.diff(places, axis=0).T, np.diff(ways, axis=0).T
-    shares = np.linalg.lstsq(by_ways, ways[-1], rcond=DEPENDENT)[0]
-    return np.asarray((means[-1] - (by_places + by_ways) @ shares) * scale)
 
 
 def _fitted(now: Searched, near: Bounds) -> tuple[Objective, Evaluation]:
