@@ -132,21 +132,24 @@ def mixture_of(
     *,
     begins: Sequence[NDArray[np.float64]] = (),
     most: int = MOST,
-    constant: float = 0.0,
+    earlier: Mixture | None = None,
+    narrowest: bool = False,
 ) -> Mixture:
     """The posterior of theta over all explanations.
 
     First every explanation is compared with the residuals linear around unknowns (n_unknowns,), within `TRUSTED_SD`
     there (see `LinearEvidence`). Then the minimum of the likeliest, `most` at most, is found on the `posterior`,
     however far, with the evidence there. begins (n_unknowns,) each: where further minima of the likeliest explanation
-    are sought; constant: what the objective is more than the `posterior`. Raises `EstimationError` where images and
-    prior leave an unknown open, or no minimum can be solved for.
+    are sought; earlier: what is known of explanations near by, where their minima are sought; narrowest: whether
+    homogeneous tissues alone are compared. Raises `EstimationError` where images and prior leave an unknown open, or no
+    minimum can be solved for.
     """
     n = posterior.n_parameters
     with determined():
-        compared = LinearEvidence.of(posterior.parameters, evaluation, unknowns).compared(most)
-    jobs = [(of, of.unknowns) for of in compared]
-    found = [each for each in mapped(lambda job: _laplace(posterior, *job, bounds), jobs) if each is not None]
+        compared = LinearEvidence.of(posterior.parameters, evaluation, unknowns).compared(most, narrowest=narrowest)
+    known = {of.key: of for of in (earlier.explanations if earlier else ())}
+    jobs = [(of, known.get((0, tuple(sorted(of.chosen))))) for of in compared]
+    found = [each for each in mapped(lambda job: _minimum_of(posterior, *job, bounds), jobs) if each is not None]
     if not found:
         raise EstimationError("the model cannot be solved near any explanation of the images; check images and mesh")
     likeliest = max(found, key=lambda each: each.level)
@@ -154,6 +157,7 @@ def mixture_of(
         others = [other.minimum for other in found if other.of is likeliest.of]
         if each is not None and not any(same_minimum(each.minimum.unknowns, other, n) for other in others):
             found.append(each)
+    constant = evaluation.value - posterior(unknowns).value  # of residuals that count less the larger they are
     away = [float(np.abs(each.minimum.unknowns - unknowns)[:n].max(initial=0.0)) for each in found]
     explanations = [
         Explanation(
@@ -211,14 +215,23 @@ class _Laplace:
     level: float
 
 
-def _laplace(posterior: Posterior, of: _Compared, begin: NDArray[np.float64], bounds: Bounds) -> _Laplace | None:
+def _minimum_of(posterior: Posterior, of: _Compared, known: Explanation | None, bounds: Bounds) -> _Laplace | None:
+    """An explanation's minimum, sought from where it is `known` to be near by, else from that on linear residuals."""
+    if known is None or known.minimum is None:
+        return _laplace(posterior, of, of.unknowns, bounds)
+    return _laplace(posterior, of, known.minimum.unknowns, bounds, known.volume)
+
+
+def _laplace(
+    posterior: Posterior, of: _Compared, begin: NDArray[np.float64], bounds: Bounds, volume: Volume | None = None
+) -> _Laplace | None:
     """An explanation's minimum, sought from unknowns (n_unknowns,); None where the model cannot be solved there.
 
     It is that of the marginal posterior of theta, J + 1/2 ln det H_yy with all other unknowns y at their best: that of
     J alone lies where these have most room, which soft organs leave them (Cox & Reid, J. R. Stat. Soc. B 49 (1987) 1).
-    The log-evidence is -J - 1/2 ln det H + 1/2 ln det P, H = J^T W J + P.
+    The log-evidence is -J - 1/2 ln det H + 1/2 ln det P, H = J^T W J + P. volume: that with which it begins.
     """
-    own = posterior.believing(replace(posterior.parameters.choosing(dict(of.chosen)), volume=None))
+    own = posterior.believing(replace(posterior.parameters.choosing(dict(of.chosen)), volume=volume))
     n, start = own.n_parameters, begin.copy()
     start[:n] = np.clip(start[:n], bounds.lower, bounds.upper)
     try:
@@ -235,12 +248,20 @@ def _laplace(posterior: Posterior, of: _Compared, begin: NDArray[np.float64], bo
     there, theta = minimum.evaluation, minimum.unknowns[:n]
     if not np.isfinite(there.value):
         return None
-    parameters, room = own.parameters, 12.0 / (bounds.upper - bounds.lower) ** 2  # theta has no more than its bounds
-    precision = there.matrix.plus([(np.arange(n), np.diag(room))])
-    determinants = sum(of.log_determinant for of in parameters.priors) - log_det(precision)
+    parameters = own.parameters
+    determinants = sum(of.log_determinant for of in parameters.priors) - log_det(there.matrix) - _beyond(there, bounds)
     added = 0.0 if parameters.volume is None else parameters.volume.at(theta)[0]
     level = of.log_prior + of.several + 0.5 * determinants - (there.value - added)
     return _Laplace(of, minimum, parameters.volume, level)
+
+
+def _beyond(there: Evaluation, bounds: Bounds) -> float:
+    """Ln of by how much variances of theta are more than its bounds leave: 1/12 of the square of their distance."""
+    n, room = len(bounds.lower), (bounds.upper - bounds.lower) / np.sqrt(12.0)
+    covariance = there.covariance_columns(n)[:n]
+    seen = np.isfinite(np.diag(covariance)) & (room > 0.0)
+    variances = np.linalg.eigvalsh((covariance / np.outer(*(np.where(seen, room, 1.0),) * 2))[np.ix_(seen, seen)])
+    return float(np.log(np.maximum(variances, 1.0)).sum())
 
 
 def _volume(posterior: Posterior, minimum: Minimum) -> Volume:
@@ -383,14 +404,14 @@ class LinearEvidence:
             level = 0.5 * (sum(step.determinant for step in steps) - float(left[-1, -1])) + alternatives.log_odds
             yield alternatives, _Eliminated(own, tuple(steps), -left[:-1, :-1], -left[:-1, -1], level)
 
-    def compared(self, most: int) -> list[_Compared]:
+    def compared(self, most: int, *, narrowest: bool = False) -> list[_Compared]:
         """The likeliest explanations, `most` at most: of each scenario the likeliest, and others of its images.
 
         Of several images the alternatives of each are chosen in turn, beside those of the others. Which combinations
         are likely is then told by what each of an image's alternatives loses alone.
         """
         found, fewest = list[tuple[float, Callable[[], _Compared]]](), max(most // max(len(self.images), 1), FEWEST)
-        for scenario in scenarios_of(self.parameters.blocks):
+        for scenario in scenarios_of(self.parameters.blocks)[: 1 if narrowest else None]:
             found += self._of_scenario(scenario, most)
         best = max(evidence for evidence, _ in found)
         found = sorted((each for each in found if each[0] > best - SEEN), key=lambda each: -each[0])

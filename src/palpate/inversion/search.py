@@ -24,12 +24,13 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.progress import Progress
 
 RADIUS = 1.5  # of ln E: longest step
-FITS = 3  # of noise and amplitudes in an iteration, with the residuals linear
+FITS, STAYS = 10, 0.01  # of the noise in an iteration that is not far from the end; change of its ln that ends them
 NEAR = 1e-3  # decrement of a minimum on linear residuals
 HALVINGS = 5  # of a step that leads to a state which cannot be solved, or to a worse fit
 WORSE = 2.0  # rise of J at which a step is halved: closest points that slide over voxels make less
 FLOOR = 1e-4  # of ln E: a move that is always short enough
-CALM = 0.4  # of ln of the residuals' scale: a change with which the noise still follows the search
+LAST_FIT = 0.3  # standard deviations that the mean moved: so near, the noise is fitted for the last time
+CALM = 0.8  # of ln of what residuals weigh: a change with which the noise still follows the search
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +53,15 @@ class Searched:
     """Where a search is: the objective, all unknowns with their evaluation, and the posterior as it is known there.
 
     The evaluation is that under the likeliest explanation. mixture: None before the first iteration. settled: whether
-    the noise is fitted, after which the objective stays as it is. moved: by how many of its standard deviations the
-    mean moved last.
+    the noise is fitted, and `final` for the last time, after which the objective stays as it is. moved: by how many of
+    its standard deviations the mean moved last.
     """
 
     objective: Objective
     minimum: Minimum
     mixture: Mixture | None = None
     settled: bool = False
+    final: bool = False
     moved: float = np.inf
 
     @property
@@ -114,10 +116,10 @@ def searched(
 ) -> Searched:
     """The search followed from where it has `begun` until the posterior's mean moves no more by the `rule`.
 
-    The noise is fitted anew until a step was no longer than a standard deviation, and once more where that led: fitted
-    further away, it has correlations of what is still motion. When it has changed little, it stays, and so does the
-    objective. begins (n_unknowns,) each: where further minima are sought. A search that does not end by its rule says
-    so in its minimum's outcome. Raises `EstimationError`s of models that cannot be solved.
+    The noise is fitted anew until a step was no longer than a standard deviation, and once more where steps are short:
+    fitted further away, it has correlations of what is still motion. Then it stays, and so does the objective. begins
+    (n_unknowns,) each: where further minima are sought. A search that does not end by its rule says so in its minimum's
+    outcome. Raises `EstimationError`s of models that cannot be solved.
     """
     now = begin
     for number in range(1, rule.iterations + 1):
@@ -134,43 +136,56 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     theta = at.unknowns[:n]
     radius = min([RADIUS, *(approximation.trust_radius for approximation in now.objective.approximations)])
     near = Bounds(np.maximum(bounds.lower, theta - radius), np.minimum(bounds.upper, theta + radius))
-    objective, evaluation = _fitted(now, near)
+    fits = not now.settled or (not now.final and now.moved < LAST_FIT)
+    objective, evaluation = _fitted(now, near, fits=fits)
     posterior = cheapest_posterior(objective, at.unknowns, evaluation)
     exact = now.moved < 1.0
-    constant = evaluation.value - posterior(at.unknowns).value  # of residuals that count less the larger they are
-    mixture = mixture_of(posterior, at.unknowns, evaluation, near, begins=begins, constant=constant)
-    mixture = mixture.beside(now.mixture) if now.settled and now.mixture else mixture
+    mixture = mixture_of(
+        posterior,
+        at.unknowns,
+        evaluation,
+        near,
+        begins=begins,
+        earlier=now.mixture,
+        narrowest=now.mixture is None,  # responses to patches are those of moduli that nothing speaks for
+    )
+    mixture = mixture.beside(now.mixture) if now.mixture and not fits else mixture
     objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
-    if exact and moved < rule.step_sd:
+    settled = now.settled or (exact and _change(now.objective, objective) < CALM)
+    final = now.final or now.moved < LAST_FIT
+    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled, final=final)
+    if (final if rule.step_sd < LAST_FIT else exact) and moved < rule.step_sd:
         evaluation = evaluation.under(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
-        return replace(now, objective=objective, minimum=minimum, mixture=mixture, moved=moved, settled=True)
+        return replace(before, minimum=minimum, settled=True, final=True)
     target = _target(posterior, objective, mixture, np.clip(mixture.mean, near.lower, near.upper))
-    settled = now.settled or (exact and _calm(now.objective, objective))
-    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled)
     return _taken(before, evaluation, target)
 
 
-def _calm(before: Objective, objective: Objective) -> bool:
-    """Whether the noise of no observation changed much: far away it may be so large that every move is short."""
-    was, now = (np.log([o.weighting.sd for o in of.observations]) for of in (before, objective))
-    return bool(np.all(np.abs(now - was) < CALM))
+def _change(before: Objective, objective: Objective) -> float:
+    """Largest change of ln of what a residual of any observation weighs."""
+    was, now = (np.log([o.weighting.precision for o in of.observations]) for of in (before, objective))
+    return float(np.abs(now - was).max(initial=0.0))
 
 
-def _fitted(now: Searched, near: Bounds) -> tuple[Objective, Evaluation]:
-    """The objective with the noise that the residuals show, and the evaluation with the robust weights there.
+def _fitted(now: Searched, near: Bounds, *, fits: bool) -> tuple[Objective, Evaluation]:
+    """The objective with the noise that the residuals show if it `fits`, and the evaluation with robust weights there.
 
     Both by the minimum on residuals that are linear around where the search is, under the present explanation.
     """
     at, objective = now.minimum, now.objective
-    for _ in range(1 if now.settled else FITS):
+    far = now.mixture is not None and now.moved >= 1.0
+    for _ in range(1 if far or not fits else FITS):
         linear = LinearisedObjective(objective, at.unknowns, at.evaluation)
         found = gauss_newton(linear, at.unknowns, bounds=near, tolerance=NEAR)
-        if not now.settled:
-            objective = with_scales(with_correlations(objective, found.evaluation), found.evaluation)
-    if not now.settled:
+        if not fits:
+            break
+        before, objective = objective, with_scales(with_correlations(objective, found.evaluation), found.evaluation)
+        if _change(before, objective) < STAYS:
+            break
+    if fits:
         here = LinearisedObjective(objective, at.unknowns, at.evaluation)(found.unknowns)
         objective = with_amplitudes(objective, here, found.unknowns)
     like = LinearisedObjective(objective, at.unknowns, at.evaluation)(found.unknowns).linearisations

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,9 @@ from palpate.observation.jacobian import Jacobian
 from palpate.parallel import mapped
 
 LENGTHS = (0.5, 0.8, 1.2, 2.0, 3.0, 4.5, 6.5, 9.5, 14.0)  # mm
-CELL = 1.0  # mm, edge of the cells over which residuals are averaged before pairs are compared
-PAIRS = ((0, CELL), (3, 2.0), (9, 4.0))  # mm: distances from which pairs are of cells with such edges
+CELL, FAR_CELL = 1.0, 3.0  # mm, edges of the cells over which residuals are averaged before pairs are compared
 CELLS = 2**20  # along an axis, after which cells are counted from 0 again
-REACH = 28  # mm: pairs beyond are left out
+NEAR, REACH = 8, 28  # mm: pairs beyond the first distance are of large cells, pairs beyond the second are left out
 BINS = 1 + REACH  # one for a cell with itself, then one for each mm
 FLOOR = 1e-3  # mm, the least standard deviation of a surface in an image
 SMOOTH = 4.0  # mm: the fit hardly mistakes errors with shorter correlation for motion
@@ -200,16 +198,15 @@ def _binned_products(
 ) -> NDArray[np.float64]:
     """Sums (4, n_bins) over pairs of cells, those of a cell with itself first: r_i r_j n_i.n_j, (n_i.n_j)^2, mm, 1.
 
-    A cell holds the means of its residuals, places and normals. The further apart pairs are, the larger the cells may
-    be, because these change their distance less (see `PAIRS`); each counts as many times as it has cells of 1 mm.
+    A cell holds the means of its residuals, places and normals. Pairs less than 8 mm apart are of cells of 1 mm. Others
+    are of cells of 3 mm, because 3 mm hardly change their distance; each counts as many times as it has cells of 1 mm.
     """
-    small = _cell_means(places, CELL)
-    mean, centres, units = _times(small, values), _times(small, places), _units(_times(small, normals))
-    sums = np.zeros((4, BINS))
-    for (first, size), (last, _) in pairwise((*PAIRS, (REACH, CELL))):
-        cells, count = _cell_means(centres, size), np.bincount(_cell_keys(centres, size)[1]).astype(np.float64)
-        of = _times(cells, mean), _times(cells, centres), _units(_times(cells, units))
-        sums += _pair_sums(*of, count, (first, last))
+    cells = _cell_means(places, CELL)
+    mean, centre, normal = _times(cells, values), _times(cells, places), _units(_times(cells, normals))
+    near = _pair_sums(mean, centre, normal, np.ones(len(mean)), (0, NEAR))
+    cells, count = _cell_means(centre, FAR_CELL), np.bincount(_cell_keys(centre, FAR_CELL)[1])
+    far = _times(cells, mean), _times(cells, centre), _units(_times(cells, normal))
+    sums = near + _pair_sums(*far, count.astype(np.float64), (NEAR, REACH))
     sums[:, 0] = mean @ mean, len(mean), 0.0, len(mean)
     return sums
 
