@@ -62,8 +62,8 @@ def _gain(evaluation: Evaluation, rows: NDArray[np.float64]) -> tuple[NDArray[np
 class Covariance:
     """Of the parameters, (n_parameters, n_parameters) each, dimensionless, by its independent causes.
 
-    Parameters are the log-moduli, then eta = ln(lambda / mu) of Poisson's ratios that are sought. noise: of the
-    residuals; prior: that of all unknowns, of which `causes` are the parts by the cause of their block;
+    Parameters are the log-moduli, then the further unknowns that are asked for. noise: of the residuals; prior: that of
+    all unknowns, of which `causes` are the parts by the cause of their block;
     grid: the place of the voxels, as far as it is not in noise that the residuals tell, which voxels round; mesh: what
     another mesh would make of it (of Young's moduli); held: the part of causes by blocks that are held. given_model:
     all that would be left if frame, drawing and material were as the model has them, and only the drivers' motion
@@ -83,6 +83,18 @@ class Covariance:
         """The sum of all causes."""
         return self.noise + self.prior + self.grid + self.mesh
 
+    @property
+    def correlation(self) -> NDArray[np.float64]:
+        """Correlation (n, n), dimensionless, by all causes."""
+        sd = np.sqrt(np.diag(self.total))
+        return np.asarray(self.total / np.outer(sd, sd))
+
+    def of_first(self, n: int) -> Covariance:
+        """That of the first n."""
+        noise, prior, grid, mesh = (part[:n, :n] for part in (self.noise, self.prior, self.grid, self.mesh))
+        causes, held = ({k: part[:n, :n] for k, part in of.items()} for of in (self.causes, self.held))
+        return Covariance(noise, prior, grid, mesh, causes, held, self.given_model)
+
     def shares(self, number: int) -> dict[str, float]:
         """Share of each cause, 0 to 1, in the variance of the log-modulus with a `number`."""
         rest = self.prior - sum(self.causes.values(), np.zeros_like(self.prior))
@@ -97,36 +109,41 @@ def covariance_of(
     errors: GridErrors,
     *,
     noise_of: Mapping[tuple[int, str], NoiseModel] | None = None,
+    further: Sequence[NDArray[np.int64]] = (),
 ) -> Covariance:
     """All that is known of the log-moduli's errors under one explanation of the images.
 
     The sandwich, blocks that are held, the mesh, and what the scatter over grid positions, by the `errors` there, adds
     (see `grid_covariance`); nothing of no errors. A block has the part H^-1 P_b H^-1 of the prior's.
     noise_of: the residuals' noise where it is not that of the evaluation (see `error_noise`), whose residuals hold what
-    wrong moduli leave.
+    wrong moduli leave. further: numbers (n,) of other unknowns that stand after the log-moduli, not in `given_model`.
     """
     noise_of = error_noise(evaluation) if noise_of is None else noise_of
-    mesh = mesh_covariance(objective)
+    mesh, n = mesh_covariance(objective), objective.n_parameters
     given = _given_model(objective, evaluation)
 
-    def parts(of: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Covariances by noise, prior and grid of one set of unknowns."""
-        noise, prior = _sandwich(objective, of, of.covariance_columns(objective.n_parameters).T, noise_of)
+    def parts(
+        of: Evaluation, rows: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Covariances by noise, prior and grid of combinations of one set of unknowns, by their rows of H^-1."""
+        noise, prior = _sandwich(objective, of, rows, noise_of)
         if not errors:
             return noise, prior, np.zeros_like(noise)
-        return noise, prior, grid_covariance(evaluation, scatter(shifts_by(of, errors, objective.n_parameters)), noise)
+        return noise, prior, grid_covariance(evaluation, scatter(shifts_by(_gain(of, rows), errors)), noise)
 
-    noise, prior, grid = parts(evaluation)
-    rows = evaluation.covariance_columns(objective.n_parameters).T
+    numbers = np.concatenate([np.arange(n), *further])
+    rows = evaluation.covariance_columns(int(numbers[-1]) + 1)[:, numbers].T
+    noise, prior, grid = parts(evaluation, rows)
     held = _held(objective, evaluation, rows)
     causes, prior = dict(held), prior + sum(held.values(), np.zeros_like(prior))
-    left = noise + prior + grid if given is evaluation else sum(parts(given), np.zeros_like(noise))
+    left = parts(given, given.covariance_columns(n).T) if given is not evaluation else (noise, prior, grid)
     inverse = rows.T
     for i, block in enumerate(objective.parameters.blocks):
         own = objective.parameters.columns(i)
         part = inverse[own].T @ evaluation.prior[np.ix_(own, own)] @ inverse[own]
         causes[block.cause] = causes.get(block.cause, np.zeros_like(part)) + part
-    return Covariance(noise, prior, grid, mesh, causes, held, left + mesh)
+    padded = np.pad(mesh, (0, len(numbers) - n))
+    return Covariance(noise, prior, grid, padded, causes, held, sum(left, mesh))
 
 
 def _held(objective: Objective, evaluation: Evaluation, rows: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
@@ -173,15 +190,14 @@ def mesh_covariance(objective: Objective) -> NDArray[np.float64]:
     """Covariance (n_parameters, n_parameters) of the log-moduli by their meshes: diagonal, s^2 of each tissue.
 
     s is `discretisation_sd` in the mesh of a reference state; the meshes of R reference states err independently, which
-    leaves the mean of their s^2 over R. Nothing is said of Poisson's ratios.
+    leaves the mean of their s^2 over R.
     """
     references = {state.reference: state.model for state in objective.states}
     variances = np.zeros(objective.n_parameters)
     for model in references.values():
         for i, scaled in enumerate(objective.parameters.selection.T > 0.0):
             tissues = sorted({model.regions[r] for r in np.flatnonzero(scaled)})
-            if tissues:
-                variances[i] += discretisation_sd(model.space, tissues) ** 2 / len(references) ** 2
+            variances[i] += discretisation_sd(model.space, tissues) ** 2 / len(references) ** 2
     return np.diag(variances)
 
 
@@ -292,7 +308,7 @@ def grid_position_shifts(
     The errors e of the residuals (see `grid_errors`) go through the gain of one Gauss-Newton step, -G e.
     """
     errors = grid_errors(objective, evaluation, states, draws=draws, rng=rng)
-    return shifts_by(evaluation, errors, objective.n_parameters)
+    return shifts_by(gain(evaluation, objective.n_parameters), errors)
 
 
 def grid_errors(
@@ -340,11 +356,11 @@ def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
 
 
-def shifts_by(evaluation: Evaluation, errors: GridErrors, n_parameters: int) -> NDArray[np.float64]:
-    """Shifts -G e (draws, n_parameters) of the log-moduli by errors e (n,) mm of each surface, of each draw."""
-    rows = gain(evaluation, n_parameters)
-    moved = [-sum((row @ e for row, e in zip(rows, of, strict=True)), np.zeros(n_parameters)) for of in errors]
-    return np.asarray(moved).reshape(len(moved), n_parameters)
+def shifts_by(rows: Sequence[NDArray[np.float64]], errors: GridErrors) -> NDArray[np.float64]:
+    """Shifts -G e (draws, n) by errors e (n_residuals,) mm of each surface, of each draw; rows: its gain G, 1/mm."""
+    n = len(rows[0])
+    moved = [-sum((row @ e for row, e in zip(rows, of, strict=True)), np.zeros(n)) for of in errors]
+    return np.asarray(moved).reshape(len(moved), n)
 
 
 def imaging_errors(
