@@ -34,21 +34,25 @@ def inverted(
     """The estimate of a problem, that of the bodies of a case; Poisson's ratios that it seeks are those of its models.
 
     Responses to a ratio are those at that of the model. From where an estimate ends, models at the found ratios lead
-    on, until these move by less than a tenth of their standard deviations. Raises as `_at_ratios` does.
+    on, until these move by less than a tenth of their standard deviations; under the linear law first, which is quick
+    and to which no ratio is impossible. Raises as `_at_ratios` does.
     """
-    found = _at_ratios(bodies, problem, case, settings, progress=progress, rule=rule)
-    for _ in range(ROUNDS):
+    every, linear = settings.every_start, case.estimate.seeks_poisson_ratios and problem.finite_strain
+    rounds = iter(range(ROUNDS))
+    while True:
+        found = _at_ratios(bodies, problem, case, settings, progress=progress, rule=rule, linear=linear)
         ratios = sought_ratios(found) if found.minimum.converged else ()
-        if all(ratio.settled for ratio in ratios):
-            break
+        settings = replace(settings, starts=(_theta(found),), further=every)
+        if all(ratio.settled for ratio in ratios) or next(rounds, None) is None:
+            if not linear:
+                return found
+            linear, rounds = False, iter(range(ROUNDS))
+            continue
         there = {ratio.tissue: ratio.next_model for ratio in ratios}
         words = ", ".join(f"{tissue} {ratio:.3f}" for tissue, ratio in there.items())
         progress(Line(f"again with models at the Poisson's ratios found: {words}", "search"))
         bodies = [body_with_ratios(body, there, case) for body in bodies]
         problem = joint_problem(bodies, case, progress=during("search", details(progress)))
-        from_there = replace(settings, starts=(_theta(found),), further=settings.every_start)
-        found = _at_ratios(bodies, problem, case, from_there, progress=details(progress), rule=rule)
-    return found
 
 
 def _at_ratios(
@@ -58,7 +62,8 @@ def _at_ratios(
     settings: InversionSettings,
     *,
     progress: Progress,
-    rule: StopRule = REPORTED,
+    rule: StopRule,
+    linear: bool,
 ) -> Inversion:
     """The same with models at the Poisson's ratios of the bodies; where their reference states bear loads, as these do.
 
@@ -67,10 +72,10 @@ def _at_ratios(
     reference's strain. Starts are those of the last pass. Raises `NotConverged` where this does not settle, or no such
     state is found.
     """
-    linear = during("search", progress)
-    if not case.strained_reference:
-        return invert(problem, settings, progress=linear, rule=rule)
-    found = invert(problem.linear(), settings, progress=linear, rule=rule)
+    searching = during("search", progress)
+    if linear or not case.strained_reference:
+        return invert(problem.linear() if linear else problem, settings, progress=searching, rule=rule)
+    found = invert(problem.linear(), settings, progress=searching, rule=rule)
     there, change = during("check the law", details(progress)), np.inf
     progress(Line("the reference state without its loads, and the moduli, in turn", "check the law"))
     for number in range(1, PASSES + 1):

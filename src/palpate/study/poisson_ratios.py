@@ -17,7 +17,7 @@ NOT_IDENTIFIED = "not identified"  # the verdict of what has no interval
 IDENTIFIED, WEAK = 0.05, 0.2  # largest width of an interval; soft tissue is usually given 0.40 to 0.49
 BELIEVED = 0.8  # of the prior's standard deviation: a larger one shows that the data say nothing
 WIDE = (0.05, 0.499)  # two standard deviations of a prior that is not stated
-SETTLED = 0.1  # of the standard deviation: how near the model's ratio is to the one found where its responses hold
+SETTLED, UNTOLD = 0.1, 0.5  # standard deviations to the model's ratio where its responses hold; if the data say nothing
 STEP = 2.0  # of eta: longest way from the ratio of a model to that of the next
 MODELS = (0.02, 0.4995)  # between which models are made
 
@@ -92,8 +92,9 @@ class SoughtRatio:
 
     @property
     def settled(self) -> bool:
-        """Whether the model has nearly the ratio that is found, or the data say so little of it that it need not."""
-        return abs(self.eta - eta_of_ratio(self.model)) < SETTLED * self.sd or self.sd >= BELIEVED * self.prior_sd
+        """Whether the model has nearly the ratio that is found; if the data say little of it, not far from it."""
+        near = SETTLED if self.sd < BELIEVED * self.prior_sd else UNTOLD
+        return abs(self.eta - eta_of_ratio(self.model)) < near * self.sd
 
     @property
     def next_model(self) -> float:

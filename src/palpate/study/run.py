@@ -198,7 +198,7 @@ def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSetting
     options = case.estimate
     starts = np.array(options.starts_kpa) / scale if options.starts_kpa else np.array(options.start_ratios)
     bounds = np.array(options.bounds_kpa) / scale if options.bounds_kpa else np.array(options.bounds_ratio)
-    n = parameters.n_parameters
+    n = len(parameters.tissues)
     low, high = (np.full(n, np.log(end)) for end in bounds)
     begin = tuple(np.full(n, np.log(start)) for start in starts)
     steps = np.array([pow(2, j, FURTHER) for j in range(n)])
