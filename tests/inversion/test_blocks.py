@@ -31,6 +31,7 @@ from palpate.unknowns import (
     material_blocks,
     offset_block,
     parameter_map,
+    sought_ratio_blocks,
     unit_blocks,
 )
 from palpate.unknowns.blocks import frame_blocks, only
@@ -109,6 +110,19 @@ def test_blocks_stand_in_the_order_in_which_the_model_takes_them(gelatine, motio
     assert not set(first[:n_frame]) & set(second[:n_frame])
     alone, own = mapping.alone(1)
     assert np.array_equal(alone.coefficients(x[own])[0], second)
+
+
+def test_a_ratio_that_is_sought_is_one_unknown_of_all_reference_states_and_the_last_of_each_model(gelatine):
+    modes = material_modes(gelatine.mesh, (0,), length_mm=12.0, poisson=((1,), (0,)))
+    own = {"heterogeneity_sd": 0.3, "poisson_sd": 0.02, "n_sought": 1}
+    of_each = [block for s in (0, 1) for block in material_blocks(modes, gelatine.mesh, (s,), **own)]
+    sought = sought_ratio_blocks([("gland", 0.01, 0.05)], (0, 1))
+    mapping = parameter_map(gelatine.mesh.tissues, (0, 1), [*of_each, *sought])
+    first, second = mapping.coefficients(np.arange(float(mapping.n_unknowns)))
+    assert len(first) == len(second) == modes.n_modes
+    assert first[-1] == second[-1] == mapping.n_unknowns - 1
+    assert not set(first[:-1]) & set(second[:-1])
+    assert mapping.prior_centre.tolist() == [0.0] * (mapping.n_unknowns - 1) + [0.01]
 
 
 def drawn_otherwise(twins, twin, blocks_of):

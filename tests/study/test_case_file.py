@@ -160,7 +160,6 @@ BAD = {
     "mechanics.element=P3": "did you mean",
     "estimate.method=newton": "did you mean 'gauss-newton'",
     "estimate.parameters=['poisson_ratio']": "Young's moduli are always estimated",
-    "estimate.parameters=['youngs_modulus', 'poisson_ratio']": "under the linear law only",
     "tissues.prostate.poisson_ratio_sd=0.02": "without effect",
     "estimate.parameters=['youngs_modulus', 'density']": "did you mean",
     "estimate.bounds_ratio=[2.0, 1.0]": "low < high",

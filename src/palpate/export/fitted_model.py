@@ -183,7 +183,7 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
         result.unit,
         next((item.relative_to for item in estimation.estimates), ""),
         estimation.estimates,
-        estimation.covariance.total[: len(estimation.estimates), : len(estimation.estimates)],
+        estimation.covariance.total,
         law.name,
         {parameter.name: getattr(law, parameter.name) for parameter in law.parameters},
         case.mechanics.element,

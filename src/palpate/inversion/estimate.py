@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.approximation.expansion import Expansion, coarse_equilibrium, expansion_around
-from palpate.errors import ConfigurationError
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.mixture import Mixture
 from palpate.inversion.objective import Evaluation, Objective
@@ -70,15 +69,9 @@ def invert(
 
     States that bring an approximation are estimated on it; for the others a reduced basis is made at the middle of the
     bounds and extended where the estimate goes. rule: when the estimate ends; a linear one that another law follows
-    ends near. Other minima, to which starts lead, are among what is compared. Raises `ConfigurationError` for an
-    unknown Poisson's ratio with another law, `EstimationError`s of solving; an estimate that did not converge says so
-    in its minimum's outcome.
+    ends near. Other minima, to which starts lead, are among what is compared. Raises `EstimationError`s of solving; an
+    estimate that did not converge says so in its minimum's outcome.
     """
-    if problem.finite_strain and problem.parameters.poisson:
-        raise ConfigurationError(
-            "a Poisson's ratio can be estimated under the linear law only, as finite-strain models keep those of the"
-            " tissues; estimate none, or leave out the states' `finite_strain` models (`InverseProblem.linear`)"
-        )
     bounds, n = settings.bounds, problem.parameters.n_parameters
     start = informed_start(problem, settings.centre, progress=progress)
     nothing = np.zeros(len(start.minimum.unknowns))

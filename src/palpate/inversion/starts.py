@@ -81,7 +81,10 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
         found.append(_responses(state.model, parameters.moduli(begin), found))
         states.append(replace(state, observed=found[-1].seen(state, np.zeros(state.model.n_modes))))
     progress("the motion of the walls and of the frame at these moduli")
-    objective = replace(start, states=tuple(states)).rematched(begin)
+    # at any moduli a Poisson's ratio that is sought would take what these miss, far from where its responses hold
+    held = tuple(replace(b, mean=(), choice=Choice.HELD) if b.sought else b for b in parameters.blocks)
+    still = replace(parameters, blocks=held, priors=())
+    objective = replace(start, states=tuple(states), parameters=still).rematched(begin)
     fitted = fit_coefficients(objective, begin)
     progress("what the images tell about each unknown")
     for s, (state, q) in enumerate(zip(objective.states, parameters.coefficients(fitted.unknowns), strict=True)):

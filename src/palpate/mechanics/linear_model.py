@@ -1,8 +1,7 @@
 """Small-strain equilibrium of several tissues: affine in the moduli, linear in the boundary modes.
 
-K(E) = sum_r E_r K_r, one r for each tissue, or for each part of the stiffness of a tissue whose Poisson's ratio is
-open; an admissible u = F z + M q + o is in equilibrium when F^T (K u - f) = 0, that is
-K_ff z = F^T f - F^T K (M q + o) with K_ff = F^T K F and dead loads f.
+K(E) = sum_r E_r K_r, one r for each tissue; an admissible u = F z + M q + o is in equilibrium when F^T (K u - f) = 0,
+that is K_ff z = F^T f - F^T K (M q + o) with K_ff = F^T K F and dead loads f.
 """
 
 from __future__ import annotations
@@ -37,7 +36,6 @@ from palpate.mechanics.stiffness import (
     lame_parts,
     lame_parts_by_poisson,
     stiffness_by_poisson,
-    stiffness_parts,
     tissue_stiffness,
 )
 from palpate.mesh.space import Constraint, LagrangeSpace
@@ -52,12 +50,11 @@ FURTHER = 10  # right-hand sides for each modulus beside those of the modes: sen
 class LinearModel:
     """Assembled stiffness of every meshed tissue under the conditions of one state.
 
-    regions: indices in `space.mesh.tissues` of the meshed ones, one for each of `stiffness_parts` where the Poisson's
-    ratio is open (the moduli are then E times its `lame_parts`); per region at 1 kPa: stiffness K_r (n_dof, n_dof),
+    regions: indices in `space.mesh.tissues` of the meshed ones; per region at 1 kPa: stiffness K_r (n_dof, n_dof),
     free_stiffness F^T K_r F (n_free, n_free), coupling F^T K_r [M, o] (n_free, n_modes + 1), all mN/mm.
     material: how the tissues may differ from homogeneous ones,
     to first order in its coefficients: u(E, q, c) = u(E, q) + sum_k c_k du/dc_k, coefficients being those of the
-    boundary modes, then c; weights: of each region (mu, lambda at the points, in the mean) at 1 kPa.
+    boundary modes, then c.
     """
 
     space: LagrangeSpace
@@ -67,7 +64,6 @@ class LinearModel:
     free_stiffness: tuple[sparse.csr_matrix[np.float64], ...]
     coupling: tuple[sparse.csr_matrix[np.float64], ...]
     solver: str
-    weights: tuple[tuple[float, float, float], ...]
     elements: Elements | None = None
     material: MaterialModes = HOMOGENEOUS
 
@@ -206,9 +202,9 @@ class LinearModel:
         """Lame's constants (n_tets,) of all elements at moduli (n_regions,) kPa; their slopes by Poisson's ratio."""
         tissue = self.space.mesh.region
         lame, slopes = (np.zeros((3, len(tissue))) for _ in range(2))
-        for modulus, region, weight in zip(moduli, self.regions, self.weights, strict=True):
+        for modulus, region in zip(moduli, self.regions, strict=True):
             own, ratio = tissue == region, self.space.mesh.tissues[region].poisson_ratio
-            lame[:, own] += modulus * np.array(weight)[:, None]
+            lame[:, own] = modulus * np.array(lame_parts(ratio, dilatation))[:, None]
             slopes[:, own] = modulus * np.array(lame_parts_by_poisson(ratio, dilatation))[:, None]
         return Moduli(*lame), Moduli(*slopes)
 
@@ -386,7 +382,7 @@ def poisson_tangents(system: LinearSystem, values: NDArray[np.float64], dilatati
     """Columns du / d nu_r = -F K_ff^-1 F^T E_r dK_r/dnu u (k, n_dof, n_regions) mm of equilibria u (n_dof, k) mm.
 
     One column for each tissue. Equilibria of a body at one system's moduli, under whatever is prescribed; dilatation:
-    that with which the model was made. The tissues' Poisson's ratios are closed.
+    that with which the model was made.
     """
     model, free, tissues = system.model, system.model.constraint.free, system.model.space.mesh.tissues
 
@@ -408,7 +404,6 @@ def linear_model(
     solver: str = "auto",
     dilatation: Dilatation = Dilatation.POINTWISE,
     loads: tuple[Load, ...] = (),
-    open_poisson: tuple[str, ...] = (),
     material: MaterialModes = HOMOGENEOUS,
 ) -> LinearModel:
     """Assemble the linear model of all meshed tissues of `space.mesh`, with their Poisson's ratios.
@@ -416,33 +411,21 @@ def linear_model(
     A pressure that follows its surface acts as on the surface at rest: to first order the body does not move.
 
     solver: a name of `palpate.mechanics.solvers.registry.SOLVERS` or "auto"; dilatation: that of the element, as
-    `choose_element` gives it; open_poisson: names of tissues whose Poisson's ratio the moduli say, which have one
-    modulus (kPa) for each part of their stiffness, see `LinearModel`; material: how tissues may differ from homogeneous
-    ones. Raises `ConfigurationError` when the constraint is of another space, `GeometryError` for tetrahedra without
-    positive volume.
+    `choose_element` gives it; material: how tissues may differ from homogeneous ones. Raises `ConfigurationError` when
+    the constraint is of another space, `GeometryError` for tetrahedra without positive volume.
     """
     conditions, tissues = Conditions(constraint, loads), space.mesh.tissues
     conditions.require_space(space)
 
-    Assembled = tuple[int, tuple[float, float, float], sparse.csr_matrix[np.float64], sparse.csr_matrix[np.float64]]
+    def assembled(region: int) -> tuple[sparse.csr_matrix[np.float64], sparse.csr_matrix[np.float64]]:
+        """K_r and F^T K_r F of one tissue."""
+        whole = tissue_stiffness(space, region, tissues[region].poisson_ratio, dilatation=dilatation)
+        return whole, restricted(whole, constraint.free)
 
-    def assembled(region: int) -> list[Assembled]:
-        """The region with its weights, K_r and F^T K_r F of one tissue, or of each part of it."""
-        tissue, free = tissues[region], constraint.free
-        if tissue.name in open_poisson:
-            units = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
-            every = zip(units, stiffness_parts(space, region, dilatation), strict=True)
-            parts = [(weights, part) for weights, part in every if part is not None]
-        else:
-            whole = tissue_stiffness(space, region, tissue.poisson_ratio, dilatation=dilatation)
-            parts = [(lame_parts(tissue.poisson_ratio, dilatation), whole)]
-        return [(region, w, k, restricted(k, free)) for w, k in parts]
-
-    meshed = [number for number, tissue in enumerate(tissues) if tissue.meshed]
-    parts = [part for of_tissue in mapped(assembled, meshed) for part in of_tissue]
-    regions, weights, stiffness, free_stiffness = zip(*parts, strict=True)
+    regions = tuple(number for number, tissue in enumerate(tissues) if tissue.meshed)
+    stiffness, free_stiffness = zip(*mapped(assembled, regions), strict=True)
     elements = elements_of(space, LINEAR, dilatation) if material.n_modes else None
-    model = LinearModel(space, conditions, regions, stiffness, free_stiffness, (), solver, weights, elements, material)
+    model = LinearModel(space, conditions, regions, stiffness, free_stiffness, (), solver, elements, material)
     return model.under(conditions)
 
 

@@ -37,10 +37,7 @@ def lame_by_poisson(youngs_modulus: float, poisson_ratio: float) -> tuple[float,
 
 
 def lame_parts(poisson_ratio: float, dilatation: Dilatation) -> tuple[float, float, float]:
-    """(mu, lambda at the points, lambda in the mean) over Young's modulus, dimensionless; raises `ConfigurationError`.
-
-    They are the weights of `stiffness_parts`.
-    """
+    """Mu, lambda at the points, lambda in the mean over Young's modulus, dimensionless; raises `ConfigurationError`."""
     lame, mu = lame_parameters(1.0, poisson_ratio)
     pointwise = pointwise_lame(dilatation, lame, mu)
     return mu, pointwise, lame - pointwise
@@ -66,18 +63,6 @@ def tissue_stiffness(
     positive volume, `ConfigurationError` for an impossible Poisson's ratio.
     """
     return _stiffness(space, tissue, lame_parts(poisson_ratio, dilatation))
-
-
-def stiffness_parts(
-    space: LagrangeSpace, tissue: int, dilatation: Dilatation
-) -> tuple[sparse.csr_matrix[np.float64] | None, ...]:
-    """What `tissue_stiffness` is the sum of, by the weights of `lame_parts`: (n_dof, n_dof), mN/mm, each at 1 kPa.
-
-    None for a part that this dilatation has not. All are positive semi-definite. Raises `GeometryError` as there.
-    """
-    present = [weight > 0.0 for weight in lame_parts(0.25, dilatation)]
-    units = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    return tuple(_stiffness(space, tissue, unit) if has else None for unit, has in zip(units, present, strict=True))
 
 
 def _stiffness(space: LagrangeSpace, tissue: int, weights: tuple[float, float, float]) -> sparse.csr_matrix[np.float64]:

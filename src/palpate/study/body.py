@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -40,7 +40,7 @@ from palpate.study.cost import ExpectedCost, cost_of_meshes
 from palpate.study.edge_length import EdgeLength
 from palpate.study.imaged import ImagedStates
 from palpate.study.meshing import ReferenceMesh, mesh_reference
-from palpate.study.poisson_ratios import with_stated_priors
+from palpate.study.poisson_ratios import sought_priors, with_ratios
 from palpate.study.refusals import NOTHING_MOVES
 from palpate.unknowns import (
     Block,
@@ -52,6 +52,7 @@ from palpate.unknowns import (
     offset_block,
     parameter_map,
     reference_block,
+    sought_ratio_blocks,
     unit_blocks,
     wall_blocks,
 )
@@ -116,6 +117,11 @@ def cost_of_bodies(bodies: Sequence[Body], case: Case) -> ExpectedCost:
 def strained_body(body: Body, strained: NDArray[np.float64], case: Case) -> Body:
     """The body whose reference state lies `strained` (n_points, 3) mm from where it is free of stress."""
     return _remade(body, case, strained=strained)
+
+
+def body_with_ratios(body: Body, ratios: Mapping[str, float], case: Case) -> Body:
+    """The body whose tissues have these Poisson's ratios, by their names."""
+    return _remade(body, case, space=with_ratios(body.space, ratios))
 
 
 def on_linear_elements(body: Body, case: Case) -> Body:
@@ -183,15 +189,9 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
         LaterState(model, observations, law, reference, at_rest={of.name: of.modes for of in drawn if s in of.states})
         for s, (model, law, (reference, observations)) in enumerate(zip(models, finite, seen, strict=True))
     )
-    parameters = parameter_map(
-        models[0].space.mesh.tissues,
-        models[0].regions,
-        _blocks(case, bodies[0], pairs, seen, drawn),
-        loaded=case.known_force,
-        open_poisson=_open_poisson(case, bodies[0].space.mesh),
-        dilatation=choose_element(case.mechanics.element).dilatation,
-    )
-    return InverseProblem(states, with_stated_priors(parameters, case))
+    blocks = _blocks(case, bodies[0], pairs, seen, drawn)
+    tissues, regions = models[0].space.mesh.tissues, models[0].regions
+    return InverseProblem(states, parameter_map(tissues, regions, blocks, loaded=case.known_force))
 
 
 def _blocks(
@@ -216,6 +216,7 @@ def _blocks(
             if isinstance(o, OfInstrument) and o.offset_sd:
                 blocks.append(instrument_block(o.name, s, sd=o.offset_sd))
     blocks += [reference_block(of.name, of.states, of.covariances, unit_mm=UNIT_MM) for of in drawn]
+    priors = sought_priors(body.states.before.tissues, body.space.mesh.tissues, case)
     references = [reference for reference, _ in seen]
     for reference in dict.fromkeys(references):
         states = tuple(s for s, own in enumerate(references) if own == reference)
@@ -226,6 +227,7 @@ def _blocks(
             states,
             heterogeneity_sd=case.discrepancy.heterogeneity_sd,
             poisson_sd=case.discrepancy.poisson_sd,
+            n_sought=len(priors),
         )
     every, mesh, regions = tuple(range(len(pairs))), body.space.mesh, pairs[0][0].regions
     numbered = list(enumerate(body.layers, start=len(mesh.tissues)))
@@ -240,6 +242,7 @@ def _blocks(
     believed = {"sd": case.discrepancy.layer_sd, "thickness_mm": case.discrepancy.layer_mm}
     return (
         *(blocks or unit_blocks(*(0 for _ in pairs))),
+        *sought_ratio_blocks(priors, every),
         *known_modulus_blocks(pairs[0][0].space.mesh.tissues, regions, every),
         *layer_blocks(of, every, **believed),
     )
@@ -266,12 +269,6 @@ def _drawn_at_rest(seen: Sequence[tuple[int, tuple[Observation, ...]]]) -> tuple
         for (_, name), of in found.items()
         if len(of) > 1
     )
-
-
-def _open_poisson(case: Case, mesh: TetMesh) -> tuple[str, ...]:
-    """The tissues whose Poisson's ratio the case seeks."""
-    estimated = [t.name for t in mesh.tissues if t.role is Role.ESTIMATE]
-    return tuple(estimated) if case.estimate.seeks_poisson_ratios else ()
 
 
 def stated_noise(case: Case) -> NoiseModel | None:
@@ -321,7 +318,6 @@ def _models(body: Body, case: Case, first: int) -> list[tuple[LinearModel, Presc
             dilatation=dilatation,
             loads=loads,
             solver=case.mechanics.solver,
-            open_poisson=_open_poisson(case, body.space.mesh),
             material=_material(body.space.mesh, body.layers, case),
         )
         models.append((made, motion))
@@ -329,20 +325,19 @@ def _models(body: Body, case: Case, first: int) -> list[tuple[LinearModel, Presc
 
 
 def _material(mesh: TetMesh, layers: Sequence[Layer], case: Case) -> MaterialModes:
-    """How the tissues of a body may differ from homogeneous ones with the Poisson's ratios that the case gives.
+    """How the tissues of a body may differ from homogeneous ones with their Poisson's ratios, those sought last.
 
     The layers of a tissue have its Poisson's ratio.
     """
-    sought = _open_poisson(case, mesh)
     meshed = [i for i, tissue in enumerate(mesh.tissues) if tissue.meshed]
     of_layers = [(n, layer.tissue) for n, layer in enumerate(layers, start=len(mesh.tissues))]
-    free = [i for i in meshed if mesh.tissues[i].name not in sought]
-    parts = [(i, *(n for n, tissue in of_layers if tissue == i)) for i in free]
+    sought = [i for i in meshed if case.estimate.seeks_poisson_ratios and mesh.tissues[i].role is Role.ESTIMATE]
+    given = [i for i in meshed if case.discrepancy.poisson_sd and i not in sought]
     return material_modes(
         mesh,
         [i for i in meshed if case.discrepancy.heterogeneity_sd or mesh.tissues[i].field],
         length_mm=case.discrepancy.heterogeneity_length_mm,
-        poisson=parts if case.discrepancy.poisson_sd else (),
+        poisson=[(i, *(n for n, tissue in of_layers if tissue == i)) for i in (*given, *sought)],
     )
 
 

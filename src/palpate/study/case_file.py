@@ -14,9 +14,8 @@ from typing import Any
 from palpate.errors import ConfigurationError
 from palpate.images.input_file import read_input
 from palpate.images.named_labels import printable
-from palpate.images.tissue import Role
 from palpate.study.case import Case
-from palpate.study.case_tissue import POISSON_RATIO, RATIO_SD, CaseTissue
+from palpate.study.case_tissue import POISSON_RATIO, CaseTissue
 from palpate.study.schema import Rule, read_table, shortened
 
 LARGEST_FILE = 100_000  # bytes; a case is a page of text, and one of a hundred tissues has 40 000
@@ -117,9 +116,6 @@ def case_tables(case: Case, place: Callable[[Path], str]) -> dict[str, Any]:
     if case.images is not None:
         ratios = [POISSON_RATIO if t.poisson_ratio is None else t.poisson_ratio for t in case.tissues]
         tissues = tuple(replace(t, poisson_ratio=nu) for t, nu in zip(case.tissues, ratios, strict=True))
-        if case.estimate.seeks_poisson_ratios:
-            stated = {t.name: t.poisson_ratio_sd or RATIO_SD for t in case.tissues if t.role is Role.ESTIMATE}
-            tissues = tuple(replace(t, poisson_ratio_sd=stated.get(t.name)) for t in tissues)
         case = replace(case, images=replace(case.images, align=case.align), tissues=tissues)
     return _table(case, place)
 

@@ -16,7 +16,7 @@ REMAINING = "remaining"
 TISSUE_ROLES = tuple(str(role) for role in Role if role is not Role.SLIDING)
 KILOPASCALS = (1e-3, 1e9)  # of a modulus: from the softest gels to diamond
 POISSON_RATIO = 0.45
-RATIO_SD, RATIO_SDS = 0.03, (1e-4, 10.0)  # prior of one: soft tissue usually has 0.40 to 0.49
+RATIO_SDS = (1e-4, 10.0)  # standard deviation of the prior of one
 POISSON_RATIOS = (-0.99, 0.4999)  # beyond, a solid loses its shape or its volume's give, and equations their digits
 
 
@@ -50,9 +50,10 @@ class CaseTissue:
     """A tissue as the case names it: `label` is a tuple of labels, a name of the label table, or "remaining".
 
     `poisson_ratio` None: 0.45, or what a phantom draws; `poisson_ratio_sd`: its prior standard deviation
-    where it is estimated, None: 0.03. `youngs_modulus_kpa`: a number, or the 95 % range of what is believed of a
-    `known` one. `modulus` "field": it varies in the tissue and is mapped; `field_sd`: prior standard deviation of ln E
-    inside, `field_length_mm`: of its kernel; `field_modes`: how many modes make it at the most.
+    where it is estimated, None: so wide that two of them reach 0.05 and 0.499. `youngs_modulus_kpa`: a number, or the
+    95 % range of what is believed of a `known` one. `modulus` "field": it varies in the tissue and is mapped;
+    `field_sd`: prior standard deviation of ln E inside, `field_length_mm`: of its kernel; `field_modes`: how many modes
+    make it at the most.
     """
 
     name: str

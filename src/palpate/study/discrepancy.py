@@ -14,7 +14,7 @@ from palpate.inversion import Inversion
 from palpate.mechanics.finite_strain import NEARLY_INCOMPRESSIBLE
 from palpate.mesh.surface import cut_faces
 from palpate.uncertainty import NORMAL_95, FittedState
-from palpate.unknowns import LAYER, Choice, in_series
+from palpate.unknowns import LAYER, POISSON, Choice, in_series
 
 TOLD = 2.0  # standard deviations, above which an offset is reported in words
 LEAST_TOLD_MM = 0.1
@@ -105,7 +105,7 @@ class FoundDiscrepancy:
 class FittedMaterial:
     """How the elements of a body differ from homogeneous tissues in an estimate.
 
-    log_ratio (n_tets,): ln E of each over that of its tissue; poisson_shifts: by tissue, of Poisson's ratio.
+    log_ratio (n_tets,): ln E of each over that of its tissue; poisson_shifts: by tissue, of a given Poisson's ratio.
     """
 
     log_ratio: NDArray[np.float64]
@@ -118,6 +118,7 @@ def fitted_materials(inversion: Inversion) -> tuple[FittedMaterial, ...]:
     unknowns = inversion.minimum.unknowns
     coefficients, blocks = parameters.coefficients(unknowns), enumerate(parameters.blocks)
     layers = [(b, unknowns[parameters.columns(i)]) for i, b in blocks if b.cause == LAYER]
+    sought = {block.of for block in parameters.blocks if block.sought}
     for state, of_state in zip(inversion.objective.states, coefficients, strict=True):
         mesh, material = state.model.space.mesh, state.model.material
         own = of_state[state.model.constraint.n_modes :]
@@ -126,7 +127,7 @@ def fitted_materials(inversion: Inversion) -> tuple[FittedMaterial, ...]:
             inside = np.isin(mesh.region, [state.model.regions[region] for region in block.regions])
             logs[inside] += in_series(x, np.array([block.share]))
         shifts = {mesh.tissues[number].name: shift for number, shift in material.poisson_shifts(own).items()}
-        found.append(FittedMaterial(logs, shifts))
+        found.append(FittedMaterial(logs, {name: shift for name, shift in shifts.items() if name not in sought}))
     return tuple(found)
 
 
@@ -155,10 +156,10 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
             x, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(variances(own)[0]))
             low, ratio, high = np.exp([x - half, x, x + half]).tolist()
             layers.append(LayerFound(block.of, ratio, (low, high)))
-        elif block.cause == "poisson":
+        elif block.cause == POISSON and not block.sought:
             pair += 1
             model = inversion.objective.states[block.states[0]].model
-            found = zip(model.material.poisson, unknowns[own].tolist(), variances(own).tolist(), strict=True)
+            found = zip(model.material.poisson, unknowns[own].tolist(), variances(own).tolist(), strict=False)
             for group, shift, variance in found:  # the layers of a tissue have its ratio
                 tissue = model.space.mesh.tissues[group[0]]
                 fitted = min(tissue.poisson_ratio + shift, NEARLY_INCOMPRESSIBLE)

@@ -56,10 +56,9 @@ def inversion_findings(inversion: Inversion, covariance: NDArray[np.float64]) ->
     sd = np.sqrt(np.diag(covariance))
     pairs = np.argwhere(np.tril(np.abs(covariance) > STRONG_CORRELATION * np.outer(sd, sd), -1)).tolist()
     if pairs:
-        both = [f"'{mapping.names[j]}' and '{mapping.names[i]}'" for i, j in pairs]
-        what = "moduli" if np.max(pairs) < len(mapping.tissues) else "parameters"
+        both = [f"'{mapping.tissues[j]}' and '{mapping.tissues[i]}'" for i, j in pairs]
         rest = ". Add images in which they move differently, or join them."
-        text = listing(f"These data cannot separate the {what} of ", both, rest)
+        text = listing("These data cannot separate the moduli of ", both, rest)
         findings.append(Finding("correlated", text))
     return tuple(findings)
 

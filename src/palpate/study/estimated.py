@@ -127,9 +127,9 @@ class StatedExplanation:
 class Estimation:
     """Result of one inversion.
 
-    estimates: of the moduli; poisson_ratios: of those that were sought beside them; covariance, correlation (n, n): of
-    the log-moduli, then of those ratios' eta = ln(lambda / mu); fits: the tissues of each later image; displacements:
-    (n_points, 3) mm of each later image;
+    estimates: of the moduli; poisson_ratios: of those that were sought beside them; covariance: of the log-moduli;
+    with_ratios: of these and then of the ratios under the likeliest explanation, None where none is sought; fits:
+    the tissues of each later image; displacements: (n_points, 3) mm of each later image;
     outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
     counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
     directions of the log-moduli by how well they are known; information_shares: by tissue, of each kind of data, and of
@@ -160,6 +160,7 @@ class Estimation:
     image_pairs: ImagePairs | None = None
     samples: ModulusSamples | None = None
     poisson_ratios: tuple[PoissonRatioEstimate, ...] = ()
+    with_ratios: Covariance | None = None
     forces: tuple[ForceFit, ...] = ()
     points: tuple[PointFit, ...] = ()
     variations: tuple[Variation, ...] = ()
@@ -169,10 +170,16 @@ class Estimation:
 
     @property
     def correlation(self) -> NDArray[np.float64]:
-        """Correlation (n, n) of the parameters, dimensionless."""
-        total = self.covariance.total
-        sd = np.sqrt(np.diag(total))
-        return np.asarray(total / np.outer(sd, sd))
+        """Correlation (n, n) of the log-moduli, then of the Poisson's ratios that are sought, dimensionless."""
+        own = self.covariance.correlation
+        found = own if self.with_ratios is None else self.with_ratios.correlation
+        found[: len(own), : len(own)] = own
+        return found
+
+    @property
+    def found_ratios(self) -> dict[str, float]:
+        """The Poisson's ratios that were sought, by their tissue, as far as there are any."""
+        return {of.tissue: of.value for of in self.poisson_ratios if of.value is not None}
 
 
 def no_estimate(

@@ -24,11 +24,11 @@ from palpate.study.estimate_findings import data_findings, fold_findings, invers
 from palpate.study.estimated import Estimation, ForceFit, Iteration, PointFit, Start, StatedExplanation, TissueFit
 from palpate.study.map_words import map_findings
 from palpate.study.misfit import beside_misfits, misfits_of
-from palpate.study.poisson_ratios import NOT_IDENTIFIED
+from palpate.study.poisson_ratios import NOT_IDENTIFIED, ratios_of
 from palpate.study.samples import draw_moduli
 from palpate.study.stated_posterior import as_stated
 from palpate.study.together import combinations_of, image_pairs_of, regions_of
-from palpate.study.verdicts import IDENTIFIED, estimates_of, intervals_of, ratios_of
+from palpate.study.verdicts import IDENTIFIED, estimates_of, intervals_of
 from palpate.uncertainty import (
     GRID_DRAWS,
     FittedState,
@@ -69,7 +69,9 @@ def conclude(
     rng = np.random.default_rng(seed)
     progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
     errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
-    own = covariance_of(objective, minimum.evaluation, errors)
+    sought = [objective.parameters.columns(i) for i, block in enumerate(objective.parameters.blocks) if block.sought]
+    every = covariance_of(objective, minimum.evaluation, errors, further=sought)
+    own = every.of_first(objective.n_parameters)
     progress("intervals: the models made exact where profiles end")
     posterior = as_stated(inversion, own, settings.bounds)
     covariance = posterior.mixture.covariance
@@ -80,7 +82,6 @@ def conclude(
     misfits = misfits_of(minimum.evaluation.linearisations, points, observed.states[0].space.mesh.tissues)
     told = misfits if minimum.converged else ()
     estimates = beside_misfits(estimates_of(inversion, known, covariance, truth=truth), told)
-    of_moduli = covariance.total[: len(estimates), : len(estimates)]
     stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
     pairs = pairs and pairs.with_intervals_of(stating)
     regions = regions_of(inversion, posterior, settings.bounds, tissues=stating)
@@ -111,8 +112,9 @@ def conclude(
         status="converged" if minimum.converged else "not converged",
         reason=_reason(inversion),
         estimates=estimates,
-        poisson_ratios=beside_misfits(ratios_of(inversion, known, covariance), told),
+        poisson_ratios=beside_misfits(ratios_of(inversion, every), told),
         covariance=covariance,
+        with_ratios=every if sought else None,
         starts=tuple(_start(inversion, start) for start in inversion.starts),
         fits=fits,
         forces=forces,
@@ -122,7 +124,7 @@ def conclude(
         outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
         remarks=findings,
         observations={observation.kind: observation.description for observation in objective.observations},
-        information=information(of_moduli),
+        information=information(covariance.total),
         information_shares=shares,
         discrepancy=found_discrepancy,
         combinations=combinations_of(inversion, posterior, settings.bounds, within=IDENTIFIED),

@@ -391,7 +391,7 @@ def _estimate(item: ModulusEstimate, status: str) -> dict[str, Any]:
 def _ratio(item: PoissonRatioEstimate, status: str) -> dict[str, Any]:
     """One entry of "estimates" for a Poisson's ratio, under the keys of a modulus."""
     document = _plain(item) | {"parameter": "poisson_ratio", "unit": "1", "relative_to": "", "truth": None}
-    document |= dict.fromkeys(("ratio", "ratio_interval95"))
+    document |= {"ratio": None, "ratio_interval95": None, "interval_kind": "linearised", "profile": []}
     if status != "converged":
         document |= dict.fromkeys(("value", "interval95")) | {"verdict": NOT_IDENTIFIED}
     return document

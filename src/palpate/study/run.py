@@ -17,7 +17,7 @@ from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Line, Progress, counted, during, silent
 from palpate.study.body import Body, cost_of_bodies, joint_problem, make_body
-from palpate.study.case import SOUGHT_RATIOS, Case, Mechanics
+from palpate.study.case import Case, Mechanics
 from palpate.study.case_body import LAW_NAMES
 from palpate.study.case_loads import load_warnings
 from palpate.study.cost import ExpectedCost, expected_cost, refuse_lack
@@ -27,14 +27,14 @@ from palpate.study.estimation import Observed, conclude
 from palpate.study.imaged import ImagedStates
 from palpate.study.inverted import inverted
 from palpate.study.plausibility import estimate_warnings, unit_warnings
-from palpate.study.poisson_ratios import with_found_ratios
+from palpate.study.poisson_ratios import with_ratios
 from palpate.study.provenance import image_names, input_digests, software_versions
 from palpate.study.read import read_case_images, read_states
 from palpate.study.refusals import linear_strain_warnings
 from palpate.study.result import CaseResult, MeshResult, MeshSummary, PairResult, Provenance
 from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
-from palpate.unknowns import ParameterMap, eta_of_ratio
+from palpate.unknowns import ParameterMap
 
 FURTHER = 13  # starts beside those of the case; a prime
 
@@ -125,7 +125,7 @@ def estimate_states(
     return CaseResult(
         case,
         estimation,
-        with_found_ratios(body.space, estimation.poisson_ratios),
+        with_ratios(body.space, estimation.found_ratios),
         _summary(body),
         states.before,
         states.after,
@@ -189,7 +189,7 @@ def _in_words(pairs: Sequence[ImagedStates]) -> str:
 
 
 def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSettings:
-    """Starts and bounds as theta; those in kPa are divided by the scale's modulus, Poisson's ratios begin as given.
+    """Starts and bounds as theta; those in kPa are divided by the scale's modulus.
 
     The case's starts, on the diagonal of all moduli, then a lattice over the bounds: with N further ones the shares
     ((k 2^j mod N) + 1/2) / N of modulus j (Korobov 1959), which fill the box evenly.
@@ -198,17 +198,13 @@ def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSetting
     options = case.estimate
     starts = np.array(options.starts_kpa) / scale if options.starts_kpa else np.array(options.start_ratios)
     bounds = np.array(options.bounds_kpa) / scale if options.bounds_kpa else np.array(options.bounds_ratio)
-    n, given = len(parameters.tissues), [eta_of_ratio(open_.given) for open_ in parameters.poisson]
-    ends = [
-        np.concatenate([np.full(n, np.log(e)), np.full(len(given), eta_of_ratio(r))])
-        for e, r in zip(bounds, SOUGHT_RATIOS, strict=True)
-    ]
-    begin = tuple(np.concatenate([np.full(n, np.log(start)), given]) for start in starts)
-    low, high = (end[:n] for end in ends)
+    n = len(parameters.tissues)
+    low, high = (np.full(n, np.log(end)) for end in bounds)
+    begin = tuple(np.full(n, np.log(start)) for start in starts)
     steps = np.array([pow(2, j, FURTHER) for j in range(n)])
     shares = (np.arange(FURTHER)[:, None] * steps % FURTHER + 0.5) / FURTHER
-    further = tuple(np.concatenate([low + share * (high - low), given]) for share in shares)
-    return InversionSettings(begin, Bounds(*ends), further)
+    further = tuple(low + share * (high - low) for share in shares)
+    return InversionSettings(begin, Bounds(low, high), further)
 
 
 def observed_of(inversion: Inversion, bodies: Sequence[Body]) -> Observed:
@@ -241,7 +237,7 @@ def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResu
         motions = estimation.displacements[first : first + states.n_later]
         found.append(
             PairResult(
-                with_found_ratios(body.space, estimation.poisson_ratios),
+                with_ratios(body.space, estimation.found_ratios),
                 _summary(body),
                 states.before,
                 states.after,

@@ -74,11 +74,10 @@ def draw_moduli(
     Normal in the coordinate of each modulus' profile (see `Marginal`). intervals: of the moduli, whose ends may be
     open.
     """
-    n = len(mapping.tissues)  # Poisson's ratios are drawn with them, and not stated
     which, away = mixture.draws(draws, rng)
-    theta = np.column_stack([of.at(which, away[:, i]) for i, of in enumerate(marginals[:n])])
+    theta = np.column_stack([of.at(which, away[:, i]) for i, of in enumerate(marginals)])
     moduli = mapping.scale_kpa * np.exp(theta)
-    is_open = np.array([[end is None for end in interval] for interval in intervals[:n]])
+    is_open = np.array([[end is None for end in interval] for interval in intervals])
     ends = np.quantile(moduli, [TAIL, 1.0 - TAIL], axis=0).T
     return ModulusSamples(
         mapping.tissues, "kPa" if mapping.absolute else "ratio", moduli, np.where(is_open, np.nan, ends)

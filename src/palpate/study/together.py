@@ -92,7 +92,7 @@ def image_pairs_of(inversion: Inversion, bounds: Bounds, errors: GridErrors) -> 
     usable = every.converged
     if np.count_nonzero(usable) < 2:
         return None
-    pairs = every.of(usable, len(names))
+    pairs = every.of(usable)
     found = agreement(pairs)
 
     def stated(
@@ -126,9 +126,7 @@ def combinations_of(
     if not inversion.minimum.converged:
         return ()
     scale = mapping.scale_kpa
-    n = len(mapping.tissues)
-    covariance = posterior.mixture.covariance.total[:n, :n]
-    own = posterior.frozen, posterior.minimum
+    covariance, own = posterior.mixture.covariance.total, (posterior.frozen, posterior.minimum)
     found = known_pairs(*own, mapping.tissues, covariance, bounds=bounds, within=within)
     return tuple(pair.times(scale) if pair.kind == "geometric mean" else pair for pair in found)
 

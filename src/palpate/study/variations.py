@@ -144,8 +144,8 @@ def what_would_change(
 ) -> tuple[Variation, ...]:
     """What an estimate rests on, in few lines: known modulus, surfaces by half a voxel, Poisson's ratios, frame, law.
 
-    laws: others than that of the estimate, which none has that seeks Poisson's ratios or measures what
-    depends on the material directly, as a force does; otherwise as `fast_variations`.
+    laws: others than that of the estimate, which none has that measures what depends on the material directly, as a
+    force does; otherwise as `fast_variations`.
     """
     path, minimum = fast_path(inversion.objective, inversion.minimum, settings.bounds), inversion.minimum
     names, equilibria = inversion.objective.parameters.tissues, _equilibria(inversion)
@@ -169,9 +169,7 @@ def what_would_change(
         """What a step to another law's equilibrium does."""
         return lambda: path.shift(path.pulled(law_errors(minimum.evaluation, equilibria, law, dilatation))(1.0))
 
-    bound = inversion.objective.parameters.poisson or any(
-        isinstance(o, OfMaterial) for o in inversion.objective.observations
-    )
+    bound = any(isinstance(o, OfMaterial) for o in inversion.objective.observations)
     changes += [(("law", "", law.name), under(law)) for law in laws if not bound]
     return (*_exact(inversion, tissues), *mapped(lambda change: _stated(names, *change), changes))
 

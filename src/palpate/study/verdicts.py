@@ -1,4 +1,4 @@
-"""Intervals and verdicts: what is stated of each modulus, and of each Poisson's ratio that was sought."""
+"""Intervals and verdicts: what is stated of each modulus."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from palpate.inversion import Inversion, InversionSettings
 from palpate.study.estimated import ModulusEstimate, no_estimate
-from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio, ratio_verdict
+from palpate.study.poisson_ratios import NOT_IDENTIFIED, not_converged
 from palpate.study.stated_posterior import StatedPosterior
 from palpate.uncertainty import (
     NORMAL_95,
@@ -20,7 +20,7 @@ from palpate.uncertainty import (
     log_interval,
     marginals_of,
 )
-from palpate.unknowns import KNOWN_MODULUS, ratio_of_eta
+from palpate.unknowns import KNOWN_MODULUS
 
 IDENTIFIED, WEAK = 4.0, 10.0  # largest ratio of an interval's ends: a factor of 2 to each side, and of 3.2
 NOT_FOLLOWED = "the 95 % interval is open: it could not be computed from a minimum"
@@ -97,7 +97,7 @@ def estimates_of(
             name,
             absolute=mapping.absolute,
             relative_to=mapping.relative_to,
-            why=_not_converged(inversion),
+            why=not_converged(inversion),
             truth=truth.get(name),
         )
         for name in mapping.tissues
@@ -165,35 +165,3 @@ def _stated(interval: Interval, word: str, unit: float = 1.0) -> Interval | None
     """The interval times a unit; none for a modulus that is not identified."""
     low, high = interval
     return None if word == NOT_IDENTIFIED else (low and low * unit, high and high * unit)
-
-
-def ratios_of(inversion: Inversion, known: Sequence[Known], covariance: Covariance) -> tuple[PoissonRatioEstimate, ...]:
-    """The same of the Poisson's ratios that are sought."""
-    mapping, found = inversion.objective.parameters, list[PoissonRatioEstimate]()
-    for open_ in mapping.poisson:
-        i, nothing = open_.column, no_ratio(open_.tissue, why=_not_converged(inversion))
-        if not known:
-            found.append(nothing)
-            continue
-        of = known[i]
-        low, high = (None if end is None else ratio_of_eta(np.log(end)) for end in of.interval)
-        of_prior = float(np.sqrt(covariance.total[i, i] * mapping.prior_precision[i, i]))
-        word, why = ratio_verdict((low, high), at_bound=of.at_bound, of_prior=of_prior)
-        points = zip(of.own.profile.theta, of.own.profile.root, strict=True)
-        found.append(
-            replace(
-                nothing,
-                value=ratio_of_eta(of.theta),
-                interval95=_stated((low, high), word),
-                interval_kind=of.own.kind,
-                verdict=word,
-                why=why,
-                variance_shares=covariance.shares(i),
-                profile=tuple((ratio_of_eta(eta), float(root)) for eta, root in points),
-            )
-        )
-    return tuple(found)
-
-
-def _not_converged(inversion: Inversion) -> str:
-    return f"the estimation did not converge: {inversion.minimum.outcome.value}"

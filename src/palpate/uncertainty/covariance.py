@@ -61,8 +61,8 @@ def _gain(evaluation: Evaluation, rows: NDArray[np.float64]) -> tuple[NDArray[np
 class Covariance:
     """Of the parameters, (n_parameters, n_parameters) each, dimensionless, by its independent causes.
 
-    Parameters are the log-moduli, then eta = ln(lambda / mu) of Poisson's ratios that are sought. noise: of the
-    residuals; prior: that of all unknowns, of which `causes` are the parts by the cause of their block;
+    Parameters are the log-moduli, then the further unknowns that are asked for. noise: of the residuals; prior: that of
+    all unknowns, of which `causes` are the parts by the cause of their block;
     grid: the place of the voxels, as far as it is not in noise that the residuals tell, which voxels round; mesh: what
     another mesh would make of it (of Young's moduli); held: the part of causes by blocks that are held. given_model:
     all that would be left if frame, drawing and material were as the model has them, and only the drivers' motion
@@ -82,6 +82,18 @@ class Covariance:
         """The sum of all causes."""
         return self.noise + self.prior + self.grid + self.mesh
 
+    @property
+    def correlation(self) -> NDArray[np.float64]:
+        """Correlation (n, n), dimensionless, by all causes."""
+        sd = np.sqrt(np.diag(self.total))
+        return np.asarray(self.total / np.outer(sd, sd))
+
+    def of_first(self, n: int) -> Covariance:
+        """That of the first n."""
+        noise, prior, grid, mesh = (part[:n, :n] for part in (self.noise, self.prior, self.grid, self.mesh))
+        causes, held = ({k: part[:n, :n] for k, part in of.items()} for of in (self.causes, self.held))
+        return Covariance(noise, prior, grid, mesh, causes, held, self.given_model)
+
     def shares(self, number: int) -> dict[str, float]:
         """Share of each cause, 0 to 1, in the variance of the log-modulus with a `number`."""
         rest = self.prior - sum(self.causes.values(), np.zeros_like(self.prior))
@@ -96,39 +108,44 @@ def covariance_of(
     errors: GridErrors,
     *,
     noise_of: Mapping[tuple[int, str], NoiseModel] | None = None,
+    further: Sequence[NDArray[np.int64]] = (),
 ) -> Covariance:
     """All that is known of the log-moduli's errors under one explanation of the images.
 
     The sandwich, blocks that are held, the mesh, and what the scatter over grid positions, by the `errors` there, adds
     (see `grid_covariance`); nothing of no errors. A block has the part H^-1 P_b H^-1 of the prior's.
     noise_of: the residuals' noise where it is not that of the evaluation (see `error_noise`), whose residuals hold what
-    wrong moduli leave.
+    wrong moduli leave. further: numbers (n,) of other unknowns that stand after the log-moduli, not in `given_model`.
     """
     noise_of = error_noise(evaluation) if noise_of is None else noise_of
     n, mesh, given = objective.n_parameters, mesh_covariance(objective), _given_model(objective, evaluation)
-    both = (evaluation,) if given is evaluation else (evaluation, given)
-    gains = [np.concatenate(rows) for rows in zip(*(gain(of, n) for of in both), strict=True)]
+    numbers = np.concatenate([np.arange(n), *further])
+    rows = evaluation.covariance_columns(int(numbers.max()) + 1)[:, numbers].T
+    sets = [(evaluation, rows)] + ([] if given is evaluation else [(given, given.covariance_columns(n).T)])
+    gains = [np.concatenate(of_sets) for of_sets in zip(*(_gain(*of) for of in sets), strict=True)]
     by_noise = noise_covariance(objective, list(zip(evaluation.linearisations, gains, strict=True)), noise_of)
 
     def parts(i: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Covariances by noise, prior and grid of one set of unknowns."""
-        own, rows = slice(i * n, (i + 1) * n), both[i].covariance_columns(n).T
-        noise, prior = by_noise[own, own], np.asarray(rows @ (both[i].prior @ rows.T))
+        (of, inverse), first = sets[i], sum(len(rows) for _, rows in sets[:i])
+        own = slice(first, first + len(inverse))
+        noise, prior = by_noise[own, own], np.asarray(inverse @ (of.prior @ inverse.T))
         if not errors:
             return noise, prior, np.zeros_like(noise)
         shifts = shifts_by([rows[own] for rows in gains], errors)
         return noise, prior, grid_covariance(evaluation, scatter(shifts), noise)
 
     noise, prior, grid = parts(0)
-    inverse = evaluation.covariance_columns(n)
-    held = _held(objective, evaluation, inverse.T)
+    held = _held(objective, evaluation, rows)
     causes, prior = dict(held), prior + sum(held.values(), np.zeros_like(prior))
-    left = noise + prior + grid if given is evaluation else sum(parts(1), np.zeros_like(noise))
+    left = (noise, prior, grid) if given is evaluation else parts(1)
+    inverse = rows.T
     for i, block in enumerate(objective.parameters.blocks):
         own = objective.parameters.columns(i)
         part = inverse[own].T @ evaluation.prior.block(own, own) @ inverse[own]
         causes[block.cause] = causes.get(block.cause, np.zeros_like(part)) + part
-    return Covariance(noise, prior, grid, mesh, causes, held, left + mesh)
+    padded = np.pad(mesh, (0, len(numbers) - n))
+    return Covariance(noise, prior, grid, padded, causes, held, sum(left, mesh))
 
 
 def _held(objective: Objective, evaluation: Evaluation, rows: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
@@ -174,15 +191,14 @@ def mesh_covariance(objective: Objective) -> NDArray[np.float64]:
     """Covariance (n_parameters, n_parameters) of the log-moduli by their meshes: diagonal, s^2 of each tissue.
 
     s is `discretisation_sd` in the mesh of a reference state; the meshes of R reference states err independently, which
-    leaves the mean of their s^2 over R. Nothing is said of Poisson's ratios.
+    leaves the mean of their s^2 over R.
     """
     references = {state.reference: state.model for state in objective.states}
     variances = np.zeros(objective.n_parameters)
     for model in references.values():
         for i, scaled in enumerate(objective.parameters.selection.T > 0.0):
             tissues = sorted({model.regions[r] for r in np.flatnonzero(scaled)})
-            if tissues:
-                variances[i] += discretisation_sd(model.space, tissues) ** 2 / len(references) ** 2
+            variances[i] += discretisation_sd(model.space, tissues) ** 2 / len(references) ** 2
     return np.diag(variances)
 
 
@@ -344,7 +360,7 @@ def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def shifts_by(gains: Sequence[NDArray[np.float64]], errors: GridErrors) -> NDArray[np.float64]:
-    """Shifts -G e (draws, n) of the log-moduli by errors e (n_residuals,) mm of each surface, of each draw.
+    """Shifts -G e (draws, n) of n unknowns by errors e (n_residuals,) mm of each surface, of each draw.
 
     gains: G (n, n_residuals) of each surface, 1/mm.
     """

@@ -45,10 +45,9 @@ class PairEstimates:
     covariance: NDArray[np.float64]
     converged: NDArray[np.bool_]
 
-    def of(self, pairs: NDArray[np.bool_], n: int) -> PairEstimates:
-        """Those of some pairs (n_pairs,) of the first n parameters."""
-        covariance = self.covariance[pairs][:, :n][:, :, pairs][..., :n]
-        return PairEstimates(self.theta[pairs, :n], covariance, self.converged[pairs])
+    def of(self, pairs: NDArray[np.bool_]) -> PairEstimates:
+        """Those of some pairs (n_pairs,)."""
+        return PairEstimates(self.theta[pairs], self.covariance[pairs][:, :, pairs], self.converged[pairs])
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +168,7 @@ def agreement(pairs: PairEstimates) -> Agreement:
         kept = every
     weights, spread = _mean(joint, every)
     without = [_mean(joint, every & _without(p, n_pairs))[0] @ theta for p in range(n_pairs)]
-    good = pairs.of(kept, n)
+    good = pairs.of(kept)
     between = np.zeros(n)
     for i in range(n):  # Q of one modulus has the mean n_pairs - 1 + variance tr P
         about = _about_the_mean(good.covariance[:, i, :, i], np.ones((len(good.theta), 1)))

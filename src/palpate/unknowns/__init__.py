@@ -6,6 +6,7 @@ from palpate.unknowns.blocks import FIELD as FIELD
 from palpate.unknowns.blocks import KNOWN_MODULUS as KNOWN_MODULUS
 from palpate.unknowns.blocks import LAYER as LAYER
 from palpate.unknowns.blocks import PATCHINESS as PATCHINESS
+from palpate.unknowns.blocks import POISSON as POISSON
 from palpate.unknowns.blocks import Acts as Acts
 from palpate.unknowns.blocks import Alternative as Alternative
 from palpate.unknowns.blocks import Block as Block
@@ -18,9 +19,8 @@ from palpate.unknowns.blocks import layer_blocks as layer_blocks
 from palpate.unknowns.blocks import material_blocks as material_blocks
 from palpate.unknowns.blocks import offset_block as offset_block
 from palpate.unknowns.blocks import reference_block as reference_block
+from palpate.unknowns.blocks import sought_ratio_blocks as sought_ratio_blocks
 from palpate.unknowns.blocks import unit_blocks as unit_blocks
 from palpate.unknowns.blocks import wall_blocks as wall_blocks
 from palpate.unknowns.parameters import ParameterMap as ParameterMap
-from palpate.unknowns.parameters import eta_of_ratio as eta_of_ratio
 from palpate.unknowns.parameters import parameter_map as parameter_map
-from palpate.unknowns.parameters import ratio_of_eta as ratio_of_eta

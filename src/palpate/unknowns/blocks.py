@@ -30,7 +30,7 @@ DRAWN_ALIKE = 0.1  # standard deviation of an offset of surfaces drawn alike, ov
 SELDOM = 0.01  # odds of a surface that is drawn otherwise
 AMPLITUDES = (0.005, 2.0)  # bounds of those that are learned, times the standard deviation of the coefficients
 KNOWN_MODULUS, FRAME, REFERENCE = "known modulus", "frame", "reference"
-FIELD, LAYER = "field", "layer"
+FIELD, LAYER, POISSON = "field", "layer", "poisson"
 BONDED = 1e-4  # standard deviation of a layer that is like its tissue, over that of one that is not
 LEAST_VARIANCE = 1e-3  # of a motion's coefficient, in its unit, so that no mode is excluded
 # standard deviation of ln E in a tissue that is nearly homogeneous, patchy, very patchy, over the stated one; and the
@@ -101,7 +101,8 @@ class Block:
     sum_t a_t^2 C_t with amplitudes a_t that are learned once, none where it is not; unit_mm: what a coefficient of 1 is
     worth where it is a motion; regions: numbers of the model's regions whose moduli it multiplies, one unknown x for
     all of them, where it acts on moduli: a `share` s of each, in series with the rest of it, is e^x times as stiff, and
-    the whole 1 / (1 + s (e^-x - 1)) times. Raises `ConfigurationError` for covariances of different sizes.
+    the whole 1 / (1 + s (e^-x - 1)) times; mean (n,): of its priors, 0 where it is empty. Raises `ConfigurationError`
+    for covariances of different sizes.
     """
 
     of: str
@@ -114,6 +115,7 @@ class Block:
     unit_mm: float = 1.0
     regions: tuple[int, ...] = ()
     share: float = 1.0
+    mean: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         shape = (len(self.alternatives[0].covariance),) * 2
@@ -127,6 +129,11 @@ class Block:
     def size(self) -> int:
         """Number of its unknowns."""
         return len(self.alternatives[0].covariance)
+
+    @property
+    def sought(self) -> bool:
+        """Whether it is a Poisson's ratio that is to be found."""
+        return self.cause == POISSON and bool(self.mean)
 
     @property
     def widest(self) -> NDArray[np.float64]:
@@ -163,7 +170,8 @@ class Block:
             return np.asarray(0.5 * (found + found.T))
 
         alternatives = tuple(replace(each, covariance=of(each.covariance)) for each in self.alternatives)
-        return replace(self, alternatives=alternatives, terms=tuple(map(of, self.terms)))
+        mean = tuple((inverse @ self.mean).tolist()) if self.mean else ()
+        return replace(self, alternatives=alternatives, terms=tuple(map(of, self.terms)), mean=mean)
 
 
 def only(covariance: NDArray[np.float64]) -> tuple[Alternative, ...]:
@@ -262,9 +270,11 @@ def material_blocks(
     *,
     heterogeneity_sd: float,
     poisson_sd: float,
+    n_sought: int = 0,
 ) -> tuple[Block, ...]:
     """How ln E varies in each tissue, and by how much Poisson's ratios are not those given.
 
+    n_sought: of how many tissues, the last of the modes, the ratios are sought, which have blocks of their own.
     Tissues are nearly homogeneous, by a third of what is stated, patchy by all of it, or very patchy by twice of it.
     The field of a tissue that is mapped has at least what is stated: a small part that differs in a tissue that is else
     homogeneous speaks for a small amplitude, which hides it.
@@ -283,10 +293,20 @@ def material_blocks(
             for share, odds, name in zip(shares, PATCHY_ODDS, PATCHINESS, strict=True)
         )
         blocks.append(Block(tissues[tissue].name, cause, Acts.MATERIAL, states, levels, Choice.PATCHINESS))
-    if modes.poisson:
-        covariance = np.eye(len(modes.poisson)) * poisson_sd**2
-        blocks.append(Block("all tissues", "poisson", Acts.MATERIAL, states, only(covariance)))
+    if n_given := len(modes.poisson) - n_sought:
+        blocks.append(Block("all tissues", POISSON, Acts.MATERIAL, states, only(np.eye(n_given) * poisson_sd**2)))
     return tuple(blocks)
+
+
+def sought_ratio_blocks(priors: Sequence[tuple[str, float, float]], states: tuple[int, ...]) -> tuple[Block, ...]:
+    """By how much the Poisson's ratio of a tissue is not that of the model: one unknown each, alike in all states.
+
+    priors: of each tissue whose ratio is sought its name, the mean and the standard deviation of the unknown.
+    """
+    return tuple(
+        Block(name, POISSON, Acts.MATERIAL, states, only(np.full((1, 1), sd**2)), mean=(mean,))
+        for name, mean, sd in priors
+    )
 
 
 def layer_blocks(

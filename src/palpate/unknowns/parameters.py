@@ -13,51 +13,11 @@ from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
-from palpate.mechanics.dilatation import Dilatation
-from palpate.mechanics.stiffness import lame_parts, lame_parts_by_poisson
 from palpate.unknowns.arrowhead import Arrowhead, Places
 from palpate.unknowns.blocks import KNOWN_MODULUS, Acts, Alternative, Block, in_series, in_series_slopes
 
 LOADS = "the known loads"
 LEVELS_OFF = 1.5  # of ln E: distance from a place at which the room that theta leaves all others levels off
-
-
-def eta_of_ratio(ratio: float) -> float:
-    """Eta = ln(lambda / mu) = ln(2 nu / (1 - 2 nu)) of a Poisson's ratio nu between 0 and 0.5."""
-    return float(np.log(2.0 * ratio / (1.0 - 2.0 * ratio)))
-
-
-def ratio_of_eta(eta: float) -> float:
-    """Poisson's ratio nu = 1/2 e^eta / (1 + e^eta) of eta = ln(lambda / mu)."""
-    return float(0.5 / (1.0 + np.exp(-eta)))
-
-
-@dataclass(frozen=True, slots=True)
-class OpenPoisson:
-    """A tissue whose Poisson's ratio nu is sought, by eta = ln(lambda / mu), which no bound cuts short near nu = 0.5.
-
-    given: that which the tissue states, where a search begins; column: number of eta among the unknowns; regions:
-    numbers of the model's regions, one for each part of the tissue's stiffness that its dilatation has (see
-    `stiffness_parts`).
-    """
-
-    tissue: str
-    given: float
-    column: int
-    regions: tuple[int, ...]
-    dilatation: Dilatation
-
-    def ratio(self, unknowns: NDArray[np.float64]) -> float:
-        """Poisson's ratio, dimensionless, of unknowns (n_unknowns,)."""
-        return ratio_of_eta(float(unknowns[self.column]))
-
-    def weights(self, unknowns: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(n_parts,) dimensionless: the moduli of the parts over Young's, and the derivatives of their ln by eta."""
-        ratio = self.ratio(unknowns)
-        parts, slopes = lame_parts(ratio, self.dilatation), lame_parts_by_poisson(ratio, self.dilatation)
-        present = [i for i, part in enumerate(lame_parts(0.25, self.dilatation)) if part > 0.0]
-        values = np.array(parts)[present]
-        return values, ratio * (1.0 - 2.0 * ratio) * np.array(slopes)[present] / values
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +81,7 @@ class Volume:
 class ParameterMap:
     """Unknowns x = [theta, x_1, ..., x_B] (n_unknowns,): the parameters theta, then those of the `blocks`.
 
-    theta: ln(E / E_reference) of the `tissues`, then eta = ln(lambda / mu) of those of `poisson` (see `OpenPoisson`).
+    theta: ln(E / E_reference) of the `tissues`.
     base (n_regions,) kPa: Young's moduli of the model's regions at theta = 0; selection (n_regions, n_parameters): 1
     where a log-modulus scales a region, several regions where tissues are tied. `relative_to`: the tissue that holds
     the scale; `absolute` is False when nothing sets one: then the first `estimate` tissue is held at 1 and every value
@@ -129,7 +89,7 @@ class ParameterMap:
     state takes its `coefficients`: of its boundary modes, then of its material modes, in the order of the blocks.
 
     The prior is normal: theta with `prior_mean` (n_parameters,) and `prior_precision` (n_parameters, n_parameters),
-    flat by default, the blocks' unknowns with the mean 0 and one of the `priors` for each block, by default what the
+    flat by default, the blocks' unknowns with their means and one of the `priors` for each block, by default what the
     blocks believe. `volume`: what integrating over the blocks' unknowns adds to J as a function of theta; None:
     nothing, the blocks' unknowns are sought. Raises `ConfigurationError` for a prior of another shape.
     """
@@ -143,7 +103,6 @@ class ParameterMap:
     prior_mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     prior_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     priors: tuple[Alternative, ...] = ()
-    poisson: tuple[OpenPoisson, ...] = ()
     volume: Volume | None = None
     _layout: _Layout = field(init=False, repr=False, compare=False)
 
@@ -177,21 +136,15 @@ class ParameterMap:
         own = [i for i, b in enumerate(self.blocks) if b.cause == KNOWN_MODULUS and b.of == self.relative_to]
         return sum(float(unknowns[self.columns(i)].sum()) for i in own)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """What each parameter is, for a reader."""
-        return (*self.tissues, *(f"Poisson's ratio of {open_.tissue}" for open_ in self.poisson))
-
     def in_words(self, unknowns: NDArray[np.float64]) -> str:
         """The parameters' values at unknowns (n_unknowns,), for the progress."""
         ratios = zip(self.tissues, np.exp(unknowns), strict=False)
-        words = [f"{name} {ratio:.2f} x {self.relative_to}" for name, ratio in ratios]
-        return ", ".join([*words, *(f"{open_.tissue} nu {open_.ratio(unknowns):.3f}" for open_ in self.poisson)])
+        return ", ".join(f"{name} {ratio:.2f} x {self.relative_to}" for name, ratio in ratios)
 
     @property
     def n_parameters(self) -> int:
         """Number of parameters theta among the unknowns."""
-        return len(self.tissues) + len(self.poisson)
+        return len(self.tissues)
 
     @property
     def n_unknowns(self) -> int:
@@ -230,7 +183,7 @@ class ParameterMap:
     @property
     def prior_centre(self) -> NDArray[np.float64]:
         """Mean (n_unknowns,) of all unknowns before the images are seen."""
-        return np.concatenate([self.prior_mean, np.zeros(self.n_coefficients)])
+        return np.concatenate([self.prior_mean, *(block.mean or np.zeros(block.size) for block in self.blocks)])
 
     def prior(self, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """1/2 (x - m)^T P (x - m) + v(theta) at unknowns x (n_unknowns,), and its gradient (n_unknowns,)."""
@@ -243,29 +196,20 @@ class ParameterMap:
         return value, pull
 
     def moduli(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The regions' moduli (n_regions,) kPa at unknowns (n_unknowns,), or at theta (n_parameters,) alone.
-
-        Young's, or those of the parts of the stiffness where Poisson's ratio is open.
-        """
+        """The regions' moduli (n_regions,) kPa at unknowns (n_unknowns,), or at theta (n_parameters,) alone."""
         logarithms = self.selection @ unknowns[: self.n_parameters]
         if len(unknowns) > self.n_parameters:
             changes = in_series(self._on_moduli(unknowns), self.shares_on_moduli)
             logarithms = logarithms + self._layout.of_regions @ changes
-        moduli = np.asarray(self.base * np.exp(logarithms))
-        for open_ in self.poisson:
-            moduli[list(open_.regions)] *= open_.weights(unknowns)[0]
-        return moduli
+        return np.asarray(self.base * np.exp(logarithms))
 
     def derivatives(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives (n_regions, n) of the moduli's logarithms at unknowns (n_unknowns,).
 
         By theta, then by the blocks' unknowns that act on moduli.
         """
-        by_theta = self.selection.copy()
-        for open_ in self.poisson:
-            by_theta[list(open_.regions), open_.column] = open_.weights(unknowns)[1]
         slopes = in_series_slopes(self._on_moduli(unknowns), self.shares_on_moduli)
-        return np.concatenate([by_theta, self._layout.of_regions * slopes], axis=1)
+        return np.concatenate([self.selection, self._layout.of_regions * slopes], axis=1)
 
     @property
     def acting_on_moduli(self) -> NDArray[np.int64]:
@@ -366,7 +310,7 @@ class ParameterMap:
         if wrong.any():
             first = int(np.flatnonzero(wrong)[0])
             raise ConfigurationError(
-                f"the prior of ln E of '{self.names[first]}' has the mean {mean[first]} and the standard deviation"
+                f"the prior of ln E of '{self.tissues[first]}' has the mean {mean[first]} and the standard deviation"
                 f" {sd[first]}; give a finite mean and a positive standard deviation (inf: no prior), or make the"
                 " modulus `known`"
             )
@@ -380,16 +324,12 @@ def parameter_map(
     *,
     loaded: bool = False,
     tied: Sequence[Sequence[str]] = (),
-    open_poisson: Sequence[str] = (),
-    dilatation: Dilatation = Dilatation.POINTWISE,
 ) -> ParameterMap:
     """Make the map for a mesh whose regions are `tissues[i] for i in regions`, with these blocks of further unknowns.
 
     The scale is the modulus of the first `known` tissue in the file, or without one what the loads say (`loaded`: known
-    loads act). tied: groups of `estimate` tissues, by name, that share one modulus. open_poisson: names of the tissues
-    whose Poisson's ratio is sought, too, those and the `dilatation` with which the `linear_model` was made. Raises
-    `ConfigurationError` when there is nothing to estimate, or a single tissue and nothing to compare it with, or when
-    the model's regions are not the parts of such a tissue.
+    loads act). tied: groups of `estimate` tissues, by name, that share one modulus. Raises `ConfigurationError` when
+    there is nothing to estimate, or a single tissue and nothing to compare it with.
     """
     meshed = [tissues[i] for i in regions]
     known = [tissue for tissue in meshed if tissue.role is Role.KNOWN]
@@ -406,22 +346,11 @@ def parameter_map(
             "nothing can be estimated: displacements fix ratios of moduli only, so a case needs an `estimate` tissue"
             " and a `known` tissue, a known load, or a second `estimate` tissue"
         )
-    parts, poisson = np.count_nonzero(lame_parts(0.25, dilatation)), list[OpenPoisson]()
-    for name in open_poisson:
-        places = tuple(i for i, tissue in enumerate(meshed) if tissue.name == name)
-        if len(places) != parts:
-            raise ConfigurationError(
-                f"the Poisson's ratio of '{name}' is unknown, but the model has {len(places)} moduli for it and not"
-                f" {parts}: make it with `linear_model(..., open_poisson=...)` and with the same dilatation"
-            )
-        given = meshed[places[0]].poisson_ratio
-        poisson.append(OpenPoisson(name, given, len(sought) + len(poisson), places, dilatation))
-    columns = [[float(tissue.name in group) for group in sought] for tissue in meshed]
-    selection = np.pad(np.array(columns), ((0, 0), (0, len(poisson))))
+    selection = np.array([[float(tissue.name in group) for group in sought] for tissue in meshed])
     names = tuple(" and ".join(group) for group in sought)
     if loaded and not known:
-        return ParameterMap(np.ones(len(meshed)), selection, names, LOADS, True, tuple(blocks), poisson=tuple(poisson))
+        return ParameterMap(np.ones(len(meshed)), selection, names, LOADS, True, tuple(blocks))
     unit = (known[0].youngs_modulus_kpa or 1.0) if absolute else 1.0
     base = np.array([(t.youngs_modulus_kpa or unit) if t.role is Role.KNOWN else unit for t in meshed])
     scale = known[0].name if absolute else " and ".join(groups[0])
-    return ParameterMap(base, selection, names, scale, absolute, tuple(blocks), poisson=tuple(poisson))
+    return ParameterMap(base, selection, names, scale, absolute, tuple(blocks))
