@@ -410,7 +410,7 @@ class LinearEvidence:
         Of several images the alternatives of each are chosen in turn, beside those of the others. Which combinations
         are likely is then told by what each of an image's alternatives loses alone.
         """
-        found, fewest = list[tuple[float, Callable[[], _Compared]]](), max(most // max(len(self.images), 1), FEWEST)
+        found, fewest = list[tuple[float, Callable[[], _Compared]]](), max(most // max(len(self.images), 1), min(FEWEST, most))
         for scenario in scenarios_of(self.parameters.blocks)[: 1 if narrowest else None]:
             found += self._of_scenario(scenario, most)
         best = max(evidence for evidence, _ in found)

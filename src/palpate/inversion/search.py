@@ -16,7 +16,7 @@ from palpate.approximation.expansion import Expansion
 from palpate.errors import EstimationError, NotConverged, SolverError
 from palpate.inversion.frozen_posterior import Posterior, cheapest_posterior
 from palpate.inversion.hyper_parameters import with_amplitudes, with_correlations, with_scales
-from palpate.inversion.mixture import Mixture, mixture_of
+from palpate.inversion.mixture import MOST, Mixture, mixture_of
 from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, gauss_newton
 from palpate.mechanics.equilibrium import ACCURACY
@@ -24,7 +24,8 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.progress import Progress
 
 RADIUS = 1.5  # of ln E: longest step
-FITS, STAYS = 10, 0.01  # of the noise in an iteration that is not far from the end; change of its ln that ends them
+FITS, FAR_FITS, STAYS = 10, 2, 0.01  # of the noise near the end, and far from it; change of its ln that ends them
+FAR_MOST = 6  # explanations that are compared far from the end
 NEAR = 1e-3  # decrement of a minimum on linear residuals
 HALVINGS = 5  # of a step that leads to a state which cannot be solved, or to a worse fit
 WORSE = 2.0  # rise of J at which a step is halved: closest points that slide over voxels make less
@@ -121,13 +122,25 @@ def searched(
     (n_unknowns,) each: where further minima are sought. A search that does not end by its rule says so in its minimum's
     outcome. Raises `EstimationError`s of models that cannot be solved.
     """
-    now = begin
+    now = begin if begin.mixture else _with_noise(begin)
     for number in range(1, rule.iterations + 1):
         progress(f"{title}, iteration {number}: {now.objective.parameters.in_words(now.minimum.unknowns)}")
         now = _iteration(now, bounds, rule, begins)
         if now.minimum.outcome is not Outcome.STEPS:
             break
     return now
+
+
+def _with_noise(begin: Searched) -> Searched:
+    """The same with the noise and amplitudes that the residuals there show, all but the moduli at their best."""
+    at, n = begin.minimum, begin.objective.n_parameters
+    held = Bounds(at.unknowns[:n], at.unknowns[:n])
+    objective, _ = _fitted(begin, held, fits=True)
+    linear = LinearisedObjective(objective, at.unknowns, at.evaluation)
+    unknowns = gauss_newton(linear, at.unknowns, bounds=held, tolerance=NEAR).unknowns
+    objective = objective.rematched(unknowns)
+    there = replace(at, unknowns=unknowns, evaluation=objective(unknowns), evaluations=at.evaluations + 1)
+    return replace(begin, objective=objective, minimum=there)
 
 
 def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[NDArray[np.float64]]) -> Searched:
@@ -146,6 +159,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         evaluation,
         near,
         begins=begins,
+        most=MOST if now.moved < 1.0 else FAR_MOST,
         earlier=now.mixture,
         narrowest=now.mixture is None,  # responses to patches are those of moduli that nothing speaks for
     )
@@ -176,8 +190,8 @@ def _fitted(now: Searched, near: Bounds, *, fits: bool) -> tuple[Objective, Eval
     Both by the minimum on residuals that are linear around where the search is, under the present explanation.
     """
     at, objective = now.minimum, now.objective
-    far = now.mixture is not None and now.moved >= 1.0
-    for _ in range(1 if far or not fits else FITS):
+    number = FITS if now.moved < 1.0 else FAR_FITS
+    for _ in range(number if fits else 1):
         linear = LinearisedObjective(objective, at.unknowns, at.evaluation)
         found = gauss_newton(linear, at.unknowns, bounds=near, tolerance=NEAR)
         if not fits:
