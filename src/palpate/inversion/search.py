@@ -31,6 +31,7 @@ HALVINGS = 5  # of a step that leads to a state which cannot be solved, or to a 
 WORSE = 2.0  # rise of J at which a step is halved: closest points that slide over voxels make less
 FLOOR = 1e-4  # of ln E: a move that is always short enough
 LAST_FIT = 0.3  # standard deviations that the mean moved: so near, the noise is fitted for the last time
+PATIENCE = 3  # iterations after which it is where a step was no longer than one: a search may go to and fro by more
 CALM = 0.8  # of ln of what residuals weigh: a change with which the noise still follows the search
 
 
@@ -54,15 +55,15 @@ class Searched:
     """Where a search is: the objective, all unknowns with their evaluation, and the posterior as it is known there.
 
     The evaluation is that under the likeliest explanation. mixture: None before the first iteration. settled: whether
-    the noise is fitted, and `final` for the last time, after which the objective stays as it is. moved: by how many of
-    its standard deviations the mean moved last.
+    the noise is fitted, after which the objective stays as it is. fits: number of iterations. moved: by how many of its
+    standard deviations the mean moved last.
     """
 
     objective: Objective
     minimum: Minimum
     mixture: Mixture | None = None
     settled: bool = False
-    final: bool = False
+    fits: int = 0
     moved: float = np.inf
 
     @property
@@ -117,8 +118,9 @@ def searched(
 ) -> Searched:
     """The search followed from where it has `begun` until the posterior's mean moves no more by the `rule`.
 
-    The noise is fitted anew until a step was no longer than a standard deviation, and once more where steps are short:
-    fitted further away, it has correlations of what is still motion. Then it stays, and so does the objective. begins
+    The noise is fitted anew until steps are short, or a search goes to and fro: fitted further away, it has
+    correlations of what is still motion. Then it stays, and so does the objective, and explanations count as they were
+    known best, which ends a search to and fro. begins
     (n_unknowns,) each: where further minima are sought. A search that does not end by its rule says so in its minimum's
     outcome. Raises `EstimationError`s of models that cannot be solved.
     """
@@ -149,8 +151,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     theta = at.unknowns[:n]
     radius = min([RADIUS, *(approximation.trust_radius for approximation in now.objective.approximations)])
     near = Bounds(np.maximum(bounds.lower, theta - radius), np.minimum(bounds.upper, theta + radius))
-    fits = not now.settled or (not now.final and now.moved < LAST_FIT)
-    objective, evaluation = _fitted(now, near, fits=fits)
+    objective, evaluation = _fitted(now, near, fits=not now.settled)
     posterior = cheapest_posterior(objective, at.unknowns, evaluation)
     exact = now.moved < 1.0
     mixture = mixture_of(
@@ -163,17 +164,17 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         earlier=now.mixture,
         narrowest=now.mixture is None,  # responses to patches are those of moduli that nothing speaks for
     )
-    mixture = mixture.beside(now.mixture) if now.mixture and not fits else mixture
+    mixture = mixture.beside(now.mixture) if now.mixture and now.settled else mixture
     objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
-    settled = now.settled or (exact and _change(now.objective, objective) < CALM)
-    final = now.final or now.moved < LAST_FIT
-    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled, final=final)
-    if (final if rule.step_sd < LAST_FIT else exact) and moved < rule.step_sd:
+    near_end = now.moved < LAST_FIT or (exact and now.fits >= PATIENCE)
+    settled = now.settled or (near_end and _change(now.objective, objective) < CALM)
+    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled, fits=now.fits + 1)
+    if (settled if rule.step_sd < LAST_FIT else exact) and moved < rule.step_sd:
         evaluation = evaluation.under(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
-        return replace(before, minimum=minimum, settled=True, final=True)
+        return replace(before, minimum=minimum, settled=True)
     target = _target(posterior, objective, mixture, np.clip(mixture.mean, near.lower, near.upper))
     return _taken(before, evaluation, target)
 
