@@ -33,7 +33,6 @@ FEWEST = 10  # the same, however many later images there are
 ROUNDS = 4  # over all images, to find the likeliest alternatives of each
 MINIMUM = 1e-3  # decrement at which the minimum of an explanation ends: 0.045 sd from it, as a search does
 VOLUMES, VOLUME_SD, AT_ONCE = 3, 0.1, 0.8  # searches with the room of all others, its accuracy in sd, ln E a search
-AS_NEAR = 0.1  # of ln E: places that are as near to an explanation
 DIFFERENCE = 0.05  # of ln E: step of derivatives of that room
 
 
@@ -43,7 +42,7 @@ class Explanation:
 
     chosen: numbers of the alternatives, by block; scenario, images: in words; theta (n_parameters,) and covariance
     (n_parameters, n_parameters): of the log-moduli, normal; volume: of all other unknowns there; level: log of the
-    probability but for a constant; away: how far theta lies from where the models were exact, of ln E; number: of the
+    probability but for a constant; number: of the
     minimum, where it has several; minimum: that of all unknowns.
     """
 
@@ -55,7 +54,6 @@ class Explanation:
     covariance: NDArray[np.float64]
     volume: Volume | None = None
     level: float = 0.0
-    away: float = 0.0
     number: int = 0
     minimum: Minimum | None = field(default=None, repr=False)
 
@@ -73,12 +71,11 @@ class Explanation:
 class Mixture:
     """The posterior of theta: explanations with their weights, the likeliest first, which add up to 1.
 
-    minimum: that of the likeliest one, of all unknowns; places (n_parameters,) each: where models were exact.
+    minimum: that of the likeliest one, of all unknowns.
     """
 
     explanations: tuple[Explanation, ...]
     minimum: Minimum = field(repr=False)
-    places: tuple[NDArray[np.float64], ...] = ()
 
     @property
     def weights(self) -> NDArray[np.float64]:
@@ -101,23 +98,6 @@ class Mixture:
     def sd(self) -> NDArray[np.float64]:
         """(n_parameters,) of theta."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
-
-    def beside(self, earlier: Mixture) -> Mixture:
-        """The same with explanations as an `earlier` mixture knows them, where its models were exact nearer to them.
-
-        Patchy tissues seem to explain more where responses to patches are those of other moduli: of each explanation
-        that place counts where it was known best, else a search goes to and fro between two of them.
-        """
-        known = {of.key: of for of in earlier.explanations}
-        kept = list[Explanation]()
-        for of in self.explanations:
-            if of.key in known:
-                kept.append(known[of.key] if known[of.key].away < of.away - AS_NEAR else of)
-            elif all(float(np.abs(of.theta - place).max()) > of.away - AS_NEAR for place in earlier.places):
-                kept.append(of)  # else it was compared nearer, and was too unlikely
-        there = {of.key for of in self.explanations}
-        kept += [of for key, of in known.items() if key not in there]
-        return _weighed(kept, (*earlier.places, *self.places))
 
     def probabilities(self, block: int) -> dict[int, float]:
         """Of the alternatives of a block that has any, by their numbers."""
@@ -161,8 +141,6 @@ def mixture_of(
         others = [other.minimum for other in found if other.of is likeliest.of]
         if each is not None and not any(same_minimum(each.minimum.unknowns, other, n) for other in others):
             found.append(each)
-    constant = evaluation.value - posterior(unknowns).value  # of residuals that count less the larger they are
-    away = [float(np.abs(each.minimum.unknowns - unknowns)[:n].max(initial=0.0)) for each in found]
     explanations = [
         Explanation(
             dict(each.of.chosen),
@@ -172,24 +150,23 @@ def mixture_of(
             each.minimum.unknowns[:n],
             each.minimum.evaluation.covariance_columns(n)[:n],
             each.volume,
-            each.level - constant,
-            distance,
+            each.level,
             sum(other.of is each.of for other in found[:i]),
             each.minimum,
         )
-        for i, (each, distance) in enumerate(zip(found, away, strict=True))
+        for i, each in enumerate(found)
     ]
-    return _weighed(explanations, (unknowns[:n],))
+    return _weighed(explanations)
 
 
-def _weighed(explanations: Sequence[Explanation], places: tuple[NDArray[np.float64], ...]) -> Mixture:
+def _weighed(explanations: Sequence[Explanation]) -> Mixture:
     """The mixture of explanations by their levels; those of no weight are left out."""
     ordered = sorted(explanations, key=lambda of: -of.level)
     weights = np.exp([of.level - ordered[0].level for of in ordered])
     kept = [replace(of, weight=w / weights.sum()) for of, w in zip(ordered, weights.tolist(), strict=True) if w > 0.0]
     minimum = kept[0].minimum
     assert minimum is not None, "explanations of a search have minima"
-    return Mixture(tuple(kept), minimum, places)
+    return Mixture(tuple(kept), minimum)
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +220,7 @@ def _laplace(
         for _ in range(VOLUMES if own.parameters.n_coefficients else 0):
             theta, sd = minimum.unknowns[:n], posterior_sd(minimum, n)
             own = own.believing(replace(own.parameters, volume=_volume(own, minimum)))
-            within = Bounds(np.maximum(bounds.lower, theta - AT_ONCE), np.minimum(bounds.upper, theta + AT_ONCE))
+            within = bounds.around(theta, AT_ONCE)
             minimum = gauss_newton(own, minimum.unknowns, bounds=within, tolerance=MINIMUM)
             if np.all(np.abs(minimum.unknowns[:n] - theta) < VOLUME_SD * sd):
                 break
@@ -261,7 +238,7 @@ def _laplace(
 
 def _beyond(there: Evaluation, bounds: Bounds) -> float:
     """Ln of by how much variances of theta are more than its bounds leave: 1/12 of the square of their distance."""
-    n, room = len(bounds.lower), (bounds.upper - bounds.lower) / np.sqrt(12.0)
+    n, room = len(bounds.lower), bounds.room / np.sqrt(12.0)
     covariance = there.covariance_columns(n)[:n]
     seen = np.isfinite(np.diag(covariance)) & (room > 0.0)
     variances = np.linalg.eigvalsh((covariance / np.outer(*(np.where(seen, room, 1.0),) * 2))[np.ix_(seen, seen)])

@@ -54,10 +54,20 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """Bounds of theta = ln(E / E_reference), (n_parameters,) each."""
+    """Bounds of theta = ln(E / E_reference), (n_parameters,) each; within: wider ones, of which they are a part."""
 
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
+    within: Bounds | None = None
+
+    @property
+    def room(self) -> NDArray[np.float64]:
+        """Their distance (n_parameters,); that of the wider ones where they are a part."""
+        return self.upper - self.lower if self.within is None else self.within.room
+
+    def around(self, theta: NDArray[np.float64], radius: float) -> Bounds:
+        """Their part within a radius of theta (n_parameters,)."""
+        return Bounds(np.maximum(self.lower, theta - radius), np.minimum(self.upper, theta + radius), self)
 
     def reached(self, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which of theta (n_parameters,) lie at a bound: what holds them there is the search, not the images."""

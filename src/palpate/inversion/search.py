@@ -32,6 +32,7 @@ WORSE = 2.0  # rise of J at which a step is halved: closest points that slide ov
 FLOOR = 1e-4  # of ln E: a move that is always short enough
 LAST_FIT = 0.3  # standard deviations that the mean moved: so near, the noise is fitted for the last time
 PATIENCE = 3  # iterations after which it is where a step was no longer than one: a search may go to and fro by more
+MEMORY, DEPENDENT = 2, 1e-2  # earlier iterations that count; relative size of ways that count as dependent
 CALM = 0.8  # of ln of what residuals weigh: a change with which the noise still follows the search
 
 
@@ -56,7 +57,8 @@ class Searched:
 
     The evaluation is that under the likeliest explanation. mixture: None before the first iteration. settled: whether
     the noise is fitted, after which the objective stays as it is. fits: number of iterations. moved: by how many of its
-    standard deviations the mean moved last.
+    standard deviations the mean moved last; led: theta (n_parameters,) of the last iterations near by, and the mean
+    (n_parameters,) found from each.
     """
 
     objective: Objective
@@ -65,6 +67,7 @@ class Searched:
     settled: bool = False
     fits: int = 0
     moved: float = np.inf
+    led: tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...] = ()
 
     @property
     def posterior(self) -> Mixture:
@@ -119,8 +122,7 @@ def searched(
     """The search followed from where it has `begun` until the posterior's mean moves no more by the `rule`.
 
     The noise is fitted anew until steps are short, or a search goes to and fro: fitted further away, it has
-    correlations of what is still motion. Then it stays, and so does the objective, and explanations count as they were
-    known best, which ends a search to and fro. begins
+    correlations of what is still motion. Then it stays, and so does the objective. begins
     (n_unknowns,) each: where further minima are sought. A search that does not end by its rule says so in its minimum's
     outcome. Raises `EstimationError`s of models that cannot be solved.
     """
@@ -150,7 +152,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     n, at = now.objective.n_parameters, now.minimum
     theta = at.unknowns[:n]
     radius = min([RADIUS, *(approximation.trust_radius for approximation in now.objective.approximations)])
-    near = Bounds(np.maximum(bounds.lower, theta - radius), np.minimum(bounds.upper, theta + radius))
+    near = bounds.around(theta, radius)
     objective, evaluation = _fitted(now, near, fits=not now.settled)
     posterior = cheapest_posterior(objective, at.unknowns, evaluation)
     exact = now.moved < 1.0
@@ -164,7 +166,6 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         earlier=now.mixture,
         narrowest=now.mixture is None,  # responses to patches are those of moduli that nothing speaks for
     )
-    mixture = mixture.beside(now.mixture) if now.mixture and now.settled else mixture
     objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
@@ -175,14 +176,33 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         evaluation = evaluation.under(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
         return replace(before, minimum=minimum, settled=True)
-    target = _target(posterior, objective, mixture, np.clip(mixture.mean, near.lower, near.upper))
-    return _taken(before, evaluation, target)
+    led = (*(now.led[-MEMORY:] if exact else ()), (theta, mixture.mean))
+    target = _target(posterior, objective, mixture, np.clip(_fixed_point(led, sd), near.lower, near.upper))
+    return _taken(replace(before, led=led), evaluation, target)
 
 
 def _change(before: Objective, objective: Objective) -> float:
     """Largest change of ln of what a residual of any observation weighs."""
     was, now = (np.log([o.weighting.precision for o in of.observations]) for of in (before, objective))
     return float(np.abs(now - was).max(initial=0.0))
+
+
+def _fixed_point(
+    led: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], sd: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Theta (n_parameters,) from which the mean should lead nowhere, by where the last iterations led.
+
+    Anderson's acceleration (Walker & Ni, SIAM J. Numer. Anal. 49 (2011) 1715) in standard deviations (n_parameters,):
+    without it a search goes to and fro where the responses to patchy tissues depend much on the moduli.
+    """
+    scale = np.where(np.isfinite(sd), sd, 1.0)  # a modulus that moves nothing has none
+    places, means = (np.stack(each) / scale for each in zip(*led, strict=True))
+    ways = means - places
+    if len(led) == 1:
+        return np.asarray(means[-1] * scale)
+    by_places, by_ways = np.diff(places, axis=0).T, np.diff(ways, axis=0).T
+    shares = np.linalg.lstsq(by_ways, ways[-1], rcond=DEPENDENT)[0]
+    return np.asarray((means[-1] - (by_places + by_ways) @ shares) * scale)
 
 
 def _fitted(now: Searched, near: Bounds, *, fits: bool) -> tuple[Objective, Evaluation]:
