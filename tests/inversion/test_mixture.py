@@ -7,8 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inversion import Bounds, Objective, cheapest_posterior, mixture_of
-from palpate.inversion.mixture import SEEN, TRUSTED_SD, LinearEvidence
+from palpate.inversion import (
+    Bounds,
+    Explanation,
+    LaterState,
+    Minimum,
+    Mixture,
+    Objective,
+    Outcome,
+    cheapest_posterior,
+    gauss_newton,
+    mixture_of,
+)
+from palpate.inversion.mixture import AS_NEAR, SEEN, TRUSTED_SD, LinearEvidence
+from palpate.observation.robust_loss import PowerLaw
+from palpate.unknowns import ParameterMap, unit_blocks
 from palpate.unknowns.blocks import Choice
 
 EVERY = 10_000  # more explanations than there are
@@ -305,3 +318,101 @@ def test_minima_of_one_explanation_are_told_apart_and_weighed(patients):
         assert low + high == pytest.approx(2.0, abs=0.01)
         assert high - low > 0.5
         assert same[0].weight == pytest.approx(same[1].weight, rel=0.02)
+
+
+def known(choice, theta, level, away, number=0):
+    """An explanation with one log-modulus, whose models were exact `away` from it."""
+    place = np.array([theta])
+    minimum = Minimum(place, None, Outcome.CONVERGED, ())
+    own = {"level": level, "away": away, "number": number, "minimum": minimum}
+    return Explanation({0: choice}, ("patchy",), (), 0.0, place, np.eye(1), **own)
+
+
+def of_all(*explanations):
+    weighed = tuple(replace(each, weight=1.0 / len(explanations)) for each in explanations)
+    return Mixture(weighed, weighed[0].minimum)
+
+
+def theta_of(mixture):
+    return {each.key: float(each.theta[0]) for each in mixture.explanations}
+
+
+FIRST, SECOND, THIRD = ((0, ((0, k),)) for k in range(3))
+
+
+def test_of_an_explanation_known_twice_that_counts_whose_models_were_nearer():
+    """By more than what is as near: else the new one, which knows the noise as it is now."""
+    now = of_all(known(0, 1.0, -3.0, away=0.5), known(1, 2.0, -2.0, away=0.5), known(2, 3.0, -2.5, away=0.5))
+    nearer, as_near, farther = 0.5 - 1.1 * AS_NEAR, 0.5 - 0.9 * AS_NEAR, 0.9
+    earlier = of_all(known(0, 1.1, -1.0, nearer), known(1, 2.1, -1.0, as_near), known(2, 3.1, -1.0, farther))
+    found = now.beside(earlier)
+    assert theta_of(found) == {FIRST: 1.1, SECOND: 2.0, THIRD: 3.0}
+    levels = np.array([-1.0, -2.0, -2.5])
+    assert found.weights == pytest.approx(np.exp(levels) / np.exp(levels).sum())
+    assert [each.level for each in found.explanations] == levels.tolist()
+    assert found.minimum.unknowns == 1.1  # of the likeliest
+    assert found.mean == pytest.approx(found.weights @ [1.1, 2.0, 3.0])
+
+
+def test_explanations_that_were_known_earlier_alone_are_added_with_their_levels():
+    now, earlier = of_all(known(0, 1.0, -1.0, 0.2)), of_all(known(1, 2.0, -2.0, 0.1), known(2, 3.0, -9.0, 0.1))
+    found = now.beside(earlier)
+    assert theta_of(found) == {FIRST: 1.0, SECOND: 2.0, THIRD: 3.0}
+    assert found.weights.sum() == pytest.approx(1.0)
+    assert np.log(found.weights) - np.log(found.weights[0]) == pytest.approx([0.0, -1.0, -8.0])
+    assert theta_of(earlier.beside(now)) == theta_of(found)
+
+
+def test_a_mixture_beside_itself_is_itself(patients):
+    rng = np.random.default_rng(13)
+    of = patients.patient(rng)
+    mixture = mixture_at(of.objective(rng), place(of))
+    again = mixture.beside(mixture)
+    assert again.weights == pytest.approx(mixture.weights)
+    assert [each.key for each in again.explanations] == [each.key for each in mixture.explanations]
+    assert again.mean == pytest.approx(mixture.mean)
+
+
+def test_several_minima_of_one_explanation_stay_apart():
+    now = of_all(known(0, 1.0, -1.0, 0.1), known(0, 3.0, -1.5, 0.9, number=1))
+    earlier = of_all(known(0, 1.2, -1.0, 0.9), known(0, 2.8, -1.2, 0.1, number=1), known(0, 5.0, -2.0, 0.5, number=2))
+    found = now.beside(earlier)
+    assert {number: theta for (number, _), theta in theta_of(found).items()} == {0: 1.0, 1: 2.8, 2: 5.0}
+    assert found.weights.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("away", [-1.0, 1.0])
+def test_levels_of_mixtures_from_different_places_compare(patients, away):
+    """With outliers, which count less the larger they are: a standard deviation off its level is within a tenth."""
+    rng = np.random.default_rng(0)
+    pulls, outlying = 0.3 * rng.standard_normal(50), np.arange(50) < 15
+    seen = 0.3 * pulls + patients.SD * rng.standard_normal(50) + 0.5 * outlying
+    read = patients.readings("gland", np.arange(50), seen)
+    read = replace(read, weighting=replace(read.weighting, loss=PowerLaw(3.0 * patients.SD)))
+    body = patients.Response(pulls[:, None], np.zeros((50, 1)), 0)
+    state = LaterState(body, (read,)).with_approximation(patients.Whole(body))
+    parameters = ParameterMap(np.ones(1), np.ones((1, 1)), ("gland",), "rest", True, unit_blocks(0))
+    objective, bounds = Objective((state,), parameters), Bounds(np.full(1, -4.0), np.full(1, 4.0))
+    best = gauss_newton(objective, np.zeros(1), bounds=bounds, tolerance=1e-9).unknowns
+    aside = best + away * patients.SD / np.linalg.norm(pulls)
+    here, there = (mixture_at(objective, x, bounds).explanations[0] for x in (best, aside))
+    weights = [objective(x).linearisations[0].weights for x in (best, aside)]
+    assert np.abs(np.log(weights[1] / weights[0])).max() > 0.02
+    assert there.level == pytest.approx(here.level, abs=0.1)
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_minima_of_one_explanation_stay_apart_in_iterations_of_a_search(patients, swapped):
+    """Of a body that answers to ln E as to 2 - ln E: from the other one, too, none is lost and none counts twice."""
+    rng = np.random.default_rng(12)
+    of = patients.without(patients.patient(rng, bend=-1.0), (0, 1, 2, 3))
+    objective = of.objective(rng, whole=True)
+    near, far = (np.concatenate([theta, np.zeros(len(of.truth) - 2)]) for theta in ([0.5, -0.3], [1.5, -0.3]))
+    first = mixture_at(objective, near, begins=[near, far])
+    other = far if swapped else near
+    mixture = mixture_at(objective, other, begins=[near, far], earlier=first).beside(first)
+    same = [each for each in mixture.explanations if each.chosen == mixture.explanations[0].chosen]
+    low, high = sorted(float(each.theta[0]) for each in same)
+    assert low + high == pytest.approx(2.0, abs=0.01)
+    assert high - low > 0.5
+    assert mixture.weights.sum() == pytest.approx(1.0)

@@ -72,7 +72,7 @@ def test_intervals_of_many_images_hold_with_an_error_of_the_reference_image(pati
 
 @pytest.mark.parametrize("seed", range(3))
 def test_amplitudes_are_those_of_the_largest_restricted_likelihood(patients, seed):
-    """Of the mean readings of 4 images, T theta + x + e, with one variance of x an organ (Patterson & Thompson 1971)."""
+    """Of mean readings T theta + x + e of 4 images, one variance of x an organ (Patterson & Thompson 1971)."""
     rng = np.random.default_rng(seed)
     of = alike(patients, rng, 4, learned=True, sd=0.5)
     of = replace(of, truth=np.append(of.truth[:2], DRAWN * rng.standard_normal(len(of.truth) - 2)))
@@ -147,7 +147,7 @@ def test_a_frozen_posterior_has_the_same_value_and_score_and_its_own_slope(twins
 
 
 def test_a_surface_that_the_reference_image_draws_otherwise_is_where_it_lies_and_moves_from_there(twins, twin):
-    """By 0.3 mm further out in the reference image, in all images alike: residuals of an organ that is so much larger."""
+    """By 0.3 mm, in all images alike: its residuals are those of an organ that is so much larger."""
     objective, _ = with_reference(twins, twin)
     parameters, nothing = objective.parameters, np.zeros(objective.parameters.n_unknowns)
     objective = objective.rematched(nothing)
