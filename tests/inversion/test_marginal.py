@@ -118,6 +118,20 @@ def test_so_it_is_at_the_end_of_a_search(patients):
     assert found.mixture.mean[0] == pytest.approx(THETA[np.argmax(levels)], abs=0.1 * spread(levels)[1])
 
 
+def test_the_room_of_all_else_decides_where_theta_is_and_is_no_part_of_the_evidence(patients):
+    """-J - 1/2 ln det H + 1/2 ln det P there, P = 1, also where the room is not 0."""
+    rooms = []
+    for seed in range(3):
+        body, parameters, seen = yielding(np.random.default_rng(seed), pulls=0.05)
+        objective = objective_of(patients, body, parameters, seen)
+        (found,) = mixture_at(objective).explanations
+        rooms.append(abs(found.volume.at(found.theta)[0]))
+        there = objective(found.minimum.unknowns)
+        expected = -there.value - 0.5 * np.linalg.slogdet(there.matrix.dense)[1]
+        assert found.level == pytest.approx(expected, abs=1e-6)
+    assert max(rooms) > 0.1
+
+
 def test_an_explanation_weighs_as_much_as_its_integral_over_all_unknowns(patients):
     """Modes that move much, or little: the ratio of both integrals; Laplace's approximation misses a tenth of it."""
     levels = tuple(Alternative(sd**2 * np.eye(2), 0.0, name) for sd, name in ((0.3, "still"), (1.0, "moves")))

@@ -71,3 +71,7 @@ def test_each_reference_image_has_its_own_and_one_that_is_seen_once_has_none(bod
     assert np.array_equal(own[0], own[1])
     assert len(own[2]) == 0
     assert not set(own[0]) & set(own[3])
+    for s in range(5):
+        moved = set(problem.parameters.unknowns_of(s))
+        assert moved >= set(own[s])
+        assert not moved & (set(own[0] if s > 1 else own[3]))
