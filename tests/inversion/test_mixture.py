@@ -401,18 +401,19 @@ def test_levels_of_mixtures_from_different_places_compare(patients, away):
     assert there.level == pytest.approx(here.level, abs=0.1)
 
 
-@pytest.mark.parametrize("swapped", [False, True])
-def test_minima_of_one_explanation_stay_apart_in_iterations_of_a_search(patients, swapped):
-    """Of a body that answers to ln E as to 2 - ln E: from the other one, too, none is lost and none counts twice."""
+@pytest.mark.parametrize("theta", [0.5, 0.8, 1.2, 1.5])
+def test_minima_of_one_explanation_stay_apart_in_iterations_of_a_search(patients, theta):
+    """Of a body that answers to ln E as to 2 - ln E: the next one seeks each where the last one found it."""
     rng = np.random.default_rng(12)
     of = patients.without(patients.patient(rng, bend=-1.0), (0, 1, 2, 3))
     objective = of.objective(rng, whole=True)
-    near, far = (np.concatenate([theta, np.zeros(len(of.truth) - 2)]) for theta in ([0.5, -0.3], [1.5, -0.3]))
+    near, far, here = (np.concatenate([[first, -0.3], np.zeros(len(of.truth) - 2)]) for first in (0.5, 1.5, theta))
     first = mixture_at(objective, near, begins=[near, far])
-    other = far if swapped else near
-    mixture = mixture_at(objective, other, begins=[near, far], earlier=first).beside(first)
+    mixture = mixture_at(objective, here, begins=[near, far], earlier=first).beside(first)
     same = [each for each in mixture.explanations if each.chosen == mixture.explanations[0].chosen]
     low, high = sorted(float(each.theta[0]) for each in same)
     assert low + high == pytest.approx(2.0, abs=0.01)
     assert high - low > 0.5
+    places = theta_of(first)
+    assert all(each.theta[0] == pytest.approx(places[each.key], abs=0.01) for each in same)
     assert mixture.weights.sum() == pytest.approx(1.0)
