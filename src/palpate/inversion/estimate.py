@@ -116,7 +116,8 @@ def at_finite_strain(near: Searched, *, progress: Progress) -> Searched:
         expansions.append(expansion_around(coarse, tolerance=EQUILIBRIUM, progress=progress))
         states.append(replace(state, approximation=None, bending=basis))
     objective = replace(before, states=tuple(states)).under(expansions)
-    return begun(objective, at.unknowns, history=at.history, evaluations=at.evaluations)
+    there = begun(objective, at.unknowns, history=at.history, evaluations=at.evaluations)
+    return replace(there, mixture=near.mixture)
 
 
 @blas_on_one_thread()

@@ -75,11 +75,12 @@ class Explanation:
 class Mixture:
     """The posterior of theta: explanations with their weights, the likeliest first, which add up to 1.
 
-    minimum: that of the likeliest one, of all unknowns.
+    minimum: that of the likeliest one, of all unknowns; places (n_parameters,) each: where models were exact.
     """
 
     explanations: tuple[Explanation, ...]
     minimum: Minimum = field(repr=False)
+    places: tuple[NDArray[np.float64], ...] = ()
 
     @property
     def weights(self) -> NDArray[np.float64]:
@@ -110,12 +111,15 @@ class Mixture:
         that place counts where it was known best, else a search goes to and fro between two of them.
         """
         known = {of.key: of for of in earlier.explanations}
-        nearest = [
-            known[of.key] if of.key in known and known[of.key].away < of.away - AS_NEAR else of
-            for of in self.explanations
-        ]
-        there = {of.key for of in nearest}
-        return _weighed([*nearest, *(of for key, of in known.items() if key not in there)])
+        kept = list[Explanation]()
+        for of in self.explanations:
+            if of.key in known:
+                kept.append(known[of.key] if known[of.key].away < of.away - AS_NEAR else of)
+            elif all(float(np.abs(of.theta - place).max()) > of.away - AS_NEAR for place in earlier.places):
+                kept.append(of)  # else it was compared nearer, and was too unlikely
+        there = {of.key for of in self.explanations}
+        kept += [of for key, of in known.items() if key not in there]
+        return _weighed(kept, (*earlier.places, *self.places))
 
     def probabilities(self, block: int) -> dict[int, float]:
         """Of the alternatives of a block that has any, by their numbers."""
@@ -177,17 +181,17 @@ def mixture_of(
         )
         for i, (each, distance) in enumerate(zip(found, away, strict=True))
     ]
-    return _weighed(explanations)
+    return _weighed(explanations, (unknowns[:n],))
 
 
-def _weighed(explanations: Sequence[Explanation]) -> Mixture:
+def _weighed(explanations: Sequence[Explanation], places: tuple[NDArray[np.float64], ...]) -> Mixture:
     """The mixture of explanations by their levels; those of no weight are left out."""
     ordered = sorted(explanations, key=lambda of: -of.level)
     weights = np.exp([of.level - ordered[0].level for of in ordered])
     kept = [replace(of, weight=w / weights.sum()) for of, w in zip(ordered, weights.tolist(), strict=True) if w > 0.0]
     minimum = kept[0].minimum
     assert minimum is not None, "explanations of a search have minima"
-    return Mixture(tuple(kept), minimum)
+    return Mixture(tuple(kept), minimum, places)
 
 
 @dataclass(frozen=True, slots=True)
@@ -413,7 +417,10 @@ class LinearEvidence:
         Of several images the alternatives of each are chosen in turn, beside those of the others. Which combinations
         are likely is then told by what each of an image's alternatives loses alone.
         """
-        found, fewest = list[tuple[float, Callable[[], _Compared]]](), max(most // max(len(self.images), 1), FEWEST)
+        found, fewest = (
+            list[tuple[float, Callable[[], _Compared]]](),
+            max(most // max(len(self.images), 1), min(FEWEST, most)),
+        )
         for scenario in scenarios_of(self.parameters.blocks)[: 1 if narrowest else None]:
             found += self._of_scenario(scenario, most)
         best = max(evidence for evidence, _ in found)

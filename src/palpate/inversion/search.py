@@ -16,7 +16,7 @@ from palpate.approximation.expansion import Expansion
 from palpate.errors import EstimationError, NotConverged, SolverError
 from palpate.inversion.frozen_posterior import Posterior, cheapest_posterior
 from palpate.inversion.hyper_parameters import with_amplitudes, with_correlations, with_scales
-from palpate.inversion.mixture import Mixture, mixture_of
+from palpate.inversion.mixture import MOST, Mixture, mixture_of
 from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, gauss_newton
 from palpate.mechanics.equilibrium import ACCURACY
@@ -24,12 +24,14 @@ from palpate.mechanics.forward import SolveCounts
 from palpate.progress import Progress
 
 RADIUS = 1.5  # of ln E: longest step
-FITS, STAYS = 10, 0.01  # of the noise in an iteration that is not far from the end; change of its ln that ends them
+FITS, FAR_FITS, STAYS = 10, 2, 0.01  # of the noise near the end, and far from it; change of its ln that ends them
+FAR_MOST = 6  # explanations that are compared far from the end
 NEAR = 1e-3  # decrement of a minimum on linear residuals
 HALVINGS = 5  # of a step that leads to a state which cannot be solved, or to a worse fit
 WORSE = 2.0  # rise of J at which a step is halved: closest points that slide over voxels make less
 FLOOR = 1e-4  # of ln E: a move that is always short enough
 LAST_FIT = 0.3  # standard deviations that the mean moved: so near, the noise is fitted for the last time
+PATIENCE = 3  # iterations after which it is where a step was no longer than one: a search may go to and fro by more
 CALM = 0.8  # of ln of what residuals weigh: a change with which the noise still follows the search
 
 
@@ -53,15 +55,15 @@ class Searched:
     """Where a search is: the objective, all unknowns with their evaluation, and the posterior as it is known there.
 
     The evaluation is that under the likeliest explanation. mixture: None before the first iteration. settled: whether
-    the noise is fitted, and `final` for the last time, after which the objective stays as it is. moved: by how many of
-    its standard deviations the mean moved last.
+    the noise is fitted, after which the objective stays as it is. fits: number of iterations. moved: by how many of its
+    standard deviations the mean moved last.
     """
 
     objective: Objective
     minimum: Minimum
     mixture: Mixture | None = None
     settled: bool = False
-    final: bool = False
+    fits: int = 0
     moved: float = np.inf
 
     @property
@@ -116,12 +118,13 @@ def searched(
 ) -> Searched:
     """The search followed from where it has `begun` until the posterior's mean moves no more by the `rule`.
 
-    The noise is fitted anew until a step was no longer than a standard deviation, and once more where steps are short:
-    fitted further away, it has correlations of what is still motion. Then it stays, and so does the objective. begins
+    The noise is fitted anew until steps are short, or a search goes to and fro: fitted further away, it has
+    correlations of what is still motion. Then it stays, and so does the objective, and explanations count as they were
+    known best, which ends a search to and fro. begins
     (n_unknowns,) each: where further minima are sought. A search that does not end by its rule says so in its minimum's
     outcome. Raises `EstimationError`s of models that cannot be solved.
     """
-    now = begin
+    now = begin if begin.mixture else _with_noise(begin)
     for number in range(1, rule.iterations + 1):
         progress(f"{title}, iteration {number}: {now.objective.parameters.in_words(now.minimum.unknowns)}")
         now = _iteration(now, bounds, rule, begins)
@@ -130,14 +133,25 @@ def searched(
     return now
 
 
+def _with_noise(begin: Searched) -> Searched:
+    """The same with the noise and amplitudes that the residuals there show, all but the moduli at their best."""
+    at, n = begin.minimum, begin.objective.n_parameters
+    held = Bounds(at.unknowns[:n], at.unknowns[:n])
+    objective, _ = _fitted(begin, held, fits=True)
+    linear = LinearisedObjective(objective, at.unknowns, at.evaluation)
+    unknowns = gauss_newton(linear, at.unknowns, bounds=held, tolerance=NEAR).unknowns
+    objective = objective.rematched(unknowns)
+    there = replace(at, unknowns=unknowns, evaluation=objective(unknowns), evaluations=at.evaluations + 1)
+    return replace(begin, objective=objective, minimum=there)
+
+
 def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[NDArray[np.float64]]) -> Searched:
     """The posterior with the models exact where the search is, and the search where its mean leads."""
     n, at = now.objective.n_parameters, now.minimum
     theta = at.unknowns[:n]
     radius = min([RADIUS, *(approximation.trust_radius for approximation in now.objective.approximations)])
     near = Bounds(np.maximum(bounds.lower, theta - radius), np.minimum(bounds.upper, theta + radius))
-    fits = not now.settled or (not now.final and now.moved < LAST_FIT)
-    objective, evaluation = _fitted(now, near, fits=fits)
+    objective, evaluation = _fitted(now, near, fits=not now.settled)
     posterior = cheapest_posterior(objective, at.unknowns, evaluation)
     exact = now.moved < 1.0
     mixture = mixture_of(
@@ -146,20 +160,21 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         evaluation,
         near,
         begins=begins,
+        most=MOST if now.moved < 1.0 else FAR_MOST,
         earlier=now.mixture,
         narrowest=now.mixture is None,  # responses to patches are those of moduli that nothing speaks for
     )
-    mixture = mixture.beside(now.mixture) if now.mixture and not fits else mixture
+    mixture = mixture.beside(now.mixture) if now.mixture and now.settled else mixture
     objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
-    settled = now.settled or (exact and _change(now.objective, objective) < CALM)
-    final = now.final or now.moved < LAST_FIT
-    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled, final=final)
-    if (final if rule.step_sd < LAST_FIT else exact) and moved < rule.step_sd:
+    near_end = now.moved < LAST_FIT or (exact and now.fits >= PATIENCE)
+    settled = now.settled or (near_end and _change(now.objective, objective) < CALM)
+    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled, fits=now.fits + 1)
+    if (settled if rule.step_sd < LAST_FIT else exact) and moved < rule.step_sd:
         evaluation = evaluation.under(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
-        return replace(before, minimum=minimum, settled=True, final=True)
+        return replace(before, minimum=minimum, settled=True)
     target = _target(posterior, objective, mixture, np.clip(mixture.mean, near.lower, near.upper))
     return _taken(before, evaluation, target)
 
@@ -176,8 +191,8 @@ def _fitted(now: Searched, near: Bounds, *, fits: bool) -> tuple[Objective, Eval
     Both by the minimum on residuals that are linear around where the search is, under the present explanation.
     """
     at, objective = now.minimum, now.objective
-    far = now.mixture is not None and now.moved >= 1.0
-    for _ in range(1 if far or not fits else FITS):
+    number = FITS if now.moved < 1.0 else FAR_FITS
+    for _ in range(number if fits else 1):
         linear = LinearisedObjective(objective, at.unknowns, at.evaluation)
         found = gauss_newton(linear, at.unknowns, bounds=near, tolerance=NEAR)
         if not fits:

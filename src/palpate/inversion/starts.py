@@ -32,6 +32,7 @@ from palpate.unknowns.blocks import FIELD, Acts, Block, Choice
 
 SCREENED = 0.01  # decrement at which the minimum of a start ends
 LEFT_OUT, LEFT_OUT_OF_MAP = 1.0, 0.3  # variances of the first noise that what is left out may explain; of a map
+APART = 1.0  # of ln E: from the middle of the bounds to where responses to all modes are made once more
 FITS, FIT = 4, 0.02  # of the coefficients; share of one posterior variance that a coefficient may still move
 
 
@@ -117,7 +118,12 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
         at_rest = {b.of: basis for b, (basis, _) in pairs if b.acts is Acts.REFERENCE and s in b.states}
         reduced = state.combined(boundary, fields, at_rest, like.projection.model if like else None)
         responses = found.pop(0)
-        projected = like.projection.under(reduced.model) if like else responses.projected(reduced.model, boundary)
+        if like:
+            projected = like.projection.under(reduced.model)
+        else:
+            stiffer = seen.moduli(np.concatenate([theta + APART, unknowns[len(theta) :]]))
+            projected = responses.projected(reduced.model, boundary)
+            projected = projected.extended(_free_responses(reduced.model, stiffer))
         made += [] if like else [_Made(modes, boundary, projected)]
         basis = responses.basis(projected, material)
         informed.append(reduced.with_approximation(basis.with_modulus_series(q, seen.derivatives(unknowns))))
@@ -137,6 +143,16 @@ def _responses(model: LinearModel, moduli: NDArray[np.float64], others: Sequence
     system = model.system(moduli)
     responses = system.single_responses(tolerance=SNAPSHOT)
     return _Responses(system, responses[:, :-1], responses[:, -1], system.response_counts)
+
+
+def _free_responses(model: LinearModel, moduli: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Responses (n_free, n_boundary) mm of a model to all modes at moduli (n_regions,) kPa.
+
+    With those at other moduli they tell how the response to every mode changes with the moduli, and so how much room
+    the moduli leave the modes.
+    """
+    responses = model.system(moduli).single_responses(tolerance=SNAPSHOT)[:, :-1]
+    return np.asarray(model.constraint.free.T @ responses, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
