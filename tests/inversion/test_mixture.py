@@ -363,6 +363,16 @@ def test_explanations_that_were_known_earlier_alone_are_added_with_their_levels(
     assert theta_of(earlier.beside(now)) == theta_of(found)
 
 
+@pytest.mark.parametrize(("place", "kept"), [(2.3, False), (1.3, False), (2.85, True), (0.5, True)])
+def test_an_explanation_that_was_too_unlikely_at_a_nearer_place_is_not_added(place, kept):
+    now = of_all(known(0, 1.0, -1.0, 0.1), known(1, 2.0, -1.5, away=0.9))
+    earlier = replace(of_all(known(0, 1.0, -1.0, 0.1)), places=(np.array([place]),))
+    found = now.beside(earlier)
+    assert theta_of(found) == ({FIRST: 1.0, SECOND: 2.0} if kept else {FIRST: 1.0})
+    assert found.weights.sum() == pytest.approx(1.0)
+    assert found.places == earlier.places
+
+
 def test_a_mixture_beside_itself_is_itself(patients):
     rng = np.random.default_rng(13)
     of = patients.patient(rng)

@@ -120,9 +120,9 @@ def searched(
 
     The noise is fitted anew until steps are short, or a search goes to and fro: fitted further away, it has
     correlations of what is still motion. Then it stays, and so does the objective, and explanations count as they were
-    known best, which ends a search to and fro. begins
-    (n_unknowns,) each: where further minima are sought. A search that does not end by its rule says so in its minimum's
-    outcome. Raises `EstimationError`s of models that cannot be solved.
+    known best, which ends a search to and fro. begins (n_unknowns,) each: where further minima are sought. A search
+    that does not end by its rule says so in its minimum's outcome. Raises `EstimationError`s of models that cannot be
+    solved.
     """
     now = begin if begin.mixture else _with_noise(begin)
     for number in range(1, rule.iterations + 1):
