@@ -23,7 +23,7 @@ from palpate.mechanics.forward import DenseEquilibrium, SolveCounts
 from palpate.observation.contract import Residuals, Weighting
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.robust_loss import PowerLaw
-from palpate.unknowns import Acts, Alternative, Block, Choice, ParameterMap
+from palpate.unknowns import Acts, Alternative, Block, Choice, ParameterMap, reference_block
 
 ORGANS = ("gland", "sac")
 N_READ, N_FRAME, N_FIELD = 9, 2, 2  # of each organ in an image; unknowns of a frame, and of a tissue's field
@@ -117,7 +117,7 @@ class Whole:
 
 @dataclass(frozen=True)
 class Readings:
-    """Numbers `seen` (n,) mm of an organ, outputs `dofs` (n,) with independent errors, an `Observation`.
+    """Numbers `seen` (n,) mm of an organ, outputs `dofs` (n,) with independent errors, an `Observation` of an image.
 
     bounds: of their scale, equal where it is stated.
     """
@@ -132,6 +132,8 @@ class Readings:
     unit: str = "mm"
     of_driver: bool = False
     observed_share: float = 1.0
+    tissue: int = 0
+    stated_noise: NoiseModel | None = None
 
     @property
     def noise_model(self):
@@ -166,6 +168,12 @@ class Readings:
 
     def fitted_noise(self, _residuals, _response=None):
         return self.noise_model
+
+    def imaging_error(self, residuals, _before, _after):
+        return np.zeros(len(residuals.values))
+
+    def growth_error(self, residuals, _tissue, _peers):
+        return np.zeros(len(residuals.values))
 
 
 def readings(name, dofs, seen, *, bounds=(SD, SD)):
@@ -209,11 +217,15 @@ def blocks_of(n_images, *, odds=0.0, seldom=-3.0, unit=1.0):
 
 @dataclass(frozen=True)
 class Patient:
-    """Bodies of one patient's later images, what is believed of their unknowns, and all unknowns as they are."""
+    """Bodies of one patient's later images, what is believed of their unknowns, and all unknowns as they are.
+
+    at_rest: modes (N_READ, m) by which the reference image draws each organ otherwise, in every image.
+    """
 
     bodies: tuple[Response, ...]
     parameters: ParameterMap
     truth: np.ndarray
+    at_rest: dict[str, np.ndarray] = field(default_factory=dict)
 
     def problem(self, rng=None, *, bounds=(SD, SD), scale=1.0, whole=False) -> InverseProblem:
         """What readings tell of the truth, with errors of `scale` SD drawn by `rng` where it is given.
@@ -224,13 +236,16 @@ class Patient:
         for s, body in enumerate(self.bodies):
             unknowns, n = self.truth, len(body.slopes)
             values = body.solve(self.parameters.moduli(unknowns), self.parameters.coefficients(unknowns)[s]).values
-            offsets = dict(zip(self.parameters.offset_names(s), self.parameters.offsets(unknowns, s), strict=True))
+            drawn = self.parameters.offsets(unknowns, s)
+            offsets = dict(zip(self.parameters.offset_names(s), drawn, strict=False))
             values = values + np.repeat([offsets.get(of, 0.0) for of in ORGANS], N_READ)
+            for of, which in self.parameters.at_rest(s).items():
+                values[np.repeat(ORGANS, N_READ) == of] += self.at_rest[of] @ drawn[which]
             values = values if rng is None else values + scale * SD * rng.standard_normal(n)
             parts = np.split(np.arange(n), len(ORGANS))
             own = [readings(of, dofs, values[dofs], bounds=bounds) for of, dofs in zip(ORGANS, parts, strict=True)]
             model = Whole(body) if whole else approximated(body)
-            states.append(LaterState(body, tuple(own)).with_approximation(model))
+            states.append(LaterState(body, tuple(own), at_rest=self.at_rest).with_approximation(model))
         return InverseProblem(tuple(states), self.parameters)
 
     def objective(self, *args, **named) -> Objective:
@@ -247,6 +262,9 @@ class Patient:
             part[:, own] = body.slopes @ chain
             for name, column in zip(names, self.parameters.acting(Acts.RESIDUALS, s), strict=True):
                 part[np.repeat(ORGANS, N_READ) == name, column] = 1.0
+            for name, which in self.parameters.at_rest(s).items():
+                columns = self.parameters.acting(Acts.REFERENCE, s)[which.start - len(names) : which.stop - len(names)]
+                part[np.ix_(np.repeat(ORGANS, N_READ) == name, columns)] = self.at_rest[name]
             rows.append(part)
         return np.concatenate(rows)
 
@@ -293,6 +311,20 @@ def with_unknowns(of: Patient, block, values) -> Patient:
     truth = of.truth.copy()
     truth[of.parameters.columns(block)] = values
     return replace(of, truth=truth)
+
+
+def drawn_at_rest(of: Patient, modes, covariances, *, learned=False) -> Patient:
+    """The same with modes (N_READ, m) by which the reference image draws each organ otherwise, which all images share.
+
+    covariances (m, m): of their coefficients, believed in sum, or by amplitudes that are `learned`.
+    """
+    own, every = of.parameters, tuple(range(len(of.bodies)))
+    blocks = [reference_block(organ, every, covariances, unit_mm=1.0) for organ in ORGANS]
+    if not learned:
+        blocks = [replace(b, terms=(), alternatives=(Alternative(np.sum(covariances, axis=0)),)) for b in blocks]
+    parameters = replace(own, blocks=(*own.blocks, *blocks), priors=())
+    truth = np.concatenate([of.truth, np.zeros(sum(block.size for block in blocks))])
+    return replace(of, parameters=parameters, truth=truth, at_rest=dict.fromkeys(ORGANS, modes))
 
 
 def in_unit(of: Patient, unit) -> Patient:

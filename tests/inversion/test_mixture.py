@@ -7,7 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inversion import Bounds, Objective, cheapest_posterior, mixture_of
+from palpate.inversion import (
+    Bounds,
+    Objective,
+    cheapest_posterior,
+    mixture_of,
+)
 from palpate.inversion.mixture import SEEN, TRUSTED_SD, LinearEvidence
 from palpate.unknowns.blocks import Choice
 
@@ -305,3 +310,21 @@ def test_minima_of_one_explanation_are_told_apart_and_weighed(patients):
         assert low + high == pytest.approx(2.0, abs=0.01)
         assert high - low > 0.5
         assert same[0].weight == pytest.approx(same[1].weight, rel=0.02)
+
+
+@pytest.mark.parametrize("theta", [0.5, 0.8, 1.2, 1.5])
+def test_minima_of_one_explanation_stay_apart_in_iterations_of_a_search(patients, theta):
+    """Of a body that answers to ln E as to 2 - ln E: the next one seeks each where the last one found it."""
+    rng = np.random.default_rng(12)
+    of = patients.without(patients.patient(rng, bend=-1.0), (0, 1, 2, 3))
+    objective = of.objective(rng, whole=True)
+    near, far, here = (np.concatenate([[first, -0.3], np.zeros(len(of.truth) - 2)]) for first in (0.5, 1.5, theta))
+    first = mixture_at(objective, near, begins=[near, far])
+    mixture = mixture_at(objective, here, begins=[near, far], earlier=first)
+    same = [each for each in mixture.explanations if each.chosen == mixture.explanations[0].chosen]
+    low, high = sorted(float(each.theta[0]) for each in same)
+    assert low + high == pytest.approx(2.0, abs=0.01)
+    assert high - low > 0.5
+    places = {each.key: each.theta[0] for each in first.explanations}
+    assert all(each.theta[0] == pytest.approx(places[each.key], abs=0.01) for each in same)
+    assert mixture.weights.sum() == pytest.approx(1.0)

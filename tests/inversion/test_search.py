@@ -267,3 +267,28 @@ def test_where_every_shorter_one_fails_too_the_reason_is_told(patients, bent):
 def test_what_it_cost_is_counted(found):
     assert found.evaluations == 2 + len(found.minimum.history)  # one for the first noise
     assert found.counts.forward == len(found.minimum.history) - 1  # exact anew at every place but the first
+
+
+@pytest.mark.parametrize("at_rest", [False, True], ids=["alone", "drawn at rest"])
+def test_the_order_of_images_does_not_show(patients, at_rest):
+    """Of three images, one of whose frames has moved, with a noise that is not known, and a common error at rest."""
+    rng = np.random.default_rng(7)
+    of = patients.with_unknowns(patients.patient(rng, 3, bend=0.3), FRAME, [1.0, 1.4])
+    if at_rest:
+        modes = 0.2 * rng.standard_normal((patients.N_READ, 3))
+        of = patients.drawn_at_rest(of, modes, [np.eye(3), np.diag([1.0, 0.1, 0.1])], learned=True)
+        of = patients.with_unknowns(of, len(of.parameters.blocks) - 1, [1.0, -0.8, 0.5])
+    problem, found = of.problem(rng, bounds=LEARNED, scale=1.5), []
+    for order in ((0, 1, 2), (2, 0, 1)):
+        end = invert(patients.reordered(problem, order), patients.settings(), progress=silent)
+        assert end.minimum.converged
+        found.append(end)
+    one, other = (end.mixture for end in found)
+    assert np.all(np.abs(other.mean - one.mean) < 0.2 * REPORTED.step_sd * sd_of(one))
+    assert sd_of(other) == pytest.approx(sd_of(one), rel=0.01)
+    assert other.explanations[0].weight == pytest.approx(one.explanations[0].weight, rel=0.02)
+    assert [other.explanations[0].images[i] for i in (1, 2, 0)] == list(one.explanations[0].images)
+    noise = [sd for sd, _ in scales(found[1].objective)]
+    assert [noise[i] for i in (2, 3, 4, 5, 0, 1)] == pytest.approx(
+        [sd for sd, _ in scales(found[0].objective)], rel=1e-3
+    )

@@ -108,9 +108,10 @@ def fixed_correspondence(
 class FrozenState:
     """One later state: z = [a, q, 1] with the amplitudes a (m,) of its `reduced` model, which answers nothing else.
 
-    Offsets of the residuals stand before the 1. expanded (n_regions,) kPa: E_0 where an expansion adds to the model, z
-    = [a, q, ln E - ln E_0, 1]; form: Q (k, k), the residuals' part of the objective is 1/2 z^T Q z; square: S (k, k),
-    their mean square is z^T S z, mm^2; common: how many first basis vectors are those of the first state.
+    Offsets of the residuals, and modes of surfaces at rest, stand before the 1. expanded (n_regions,) kPa: E_0 where an
+    expansion adds to the model, z = [a, q, ln E - ln E_0, 1]; form: Q (k, k), the residuals' part of the objective is
+    1/2 z^T Q z; square: S (k, k), their mean square is z^T S z, mm^2; common: how many first basis vectors are those of
+    the first state.
     """
 
     reduced: ReducedModel
@@ -199,9 +200,9 @@ class FrozenState:
 
 @dataclass(frozen=True, slots=True)
 class FrozenPosterior:
-    """Minus log-posterior 1/2 sum_s z_s^T Q_s z_s + 1/2 (x - m)^T P (x - m), dimensionless, of unknowns x (n,).
+    """Minus log-posterior 1/2 sum_s z_s^T Q_s z_s + 1/2 (x - m)^T P (x - m) + v(theta) of unknowns x (n,).
 
-    z_s: see `FrozenState`; m, P: those of `parameters`.
+    It is dimensionless. z_s: see `FrozenState`; m, P and the room v, if any: those of `parameters`.
     """
 
     parameters: ParameterMap
@@ -219,7 +220,7 @@ class FrozenPosterior:
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """Its value, score and Gauss-Newton matrix at unknowns (n,), without residuals; raises `SolverError`.
 
-        With D_s = d z_s / dx the score is sum_s D_s^T Q_s z_s + P (x - m), the matrix sum_s D_s^T Q_s D_s + P.
+        With D_s = d z_s / dx the score is sum_s D_s^T Q_s z_s + P (x - m) + dv/dx, the matrix sum_s D_s^T Q_s D_s + P.
         """
         parameters, prior = self.parameters, self.parameters.prior_matrix
         moduli, modulus_slopes = parameters.moduli(unknowns), parameters.derivatives(unknowns)

@@ -1,4 +1,6 @@
-"""What is set once, by a first fit: how large the residuals' noise is, how many are independent, how far walls move.
+"""What is set while a search is under way: size and number of the residuals' independent errors, and amplitudes.
+
+Amplitudes are those of how far walls move, and of how otherwise a reference image is drawn.
 
 A wall that moves by 3 mm as one piece must not be allowed to slide by 5 mm on its own: nothing in the images holds it
 back along itself, and the moduli then pay for it.

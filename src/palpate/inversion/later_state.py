@@ -71,9 +71,8 @@ class LaterState:
     ) -> LaterState:
         """The same state with models on combinations of boundary modes (n_boundary, k) and of fields (n_fields, l).
 
-        at_rest: combinations (m, j) of the modes of surfaces at rest, by their names.
-
-        like: the model of another state of the body on the same combinations, whose modes and material serve again.
+        at_rest: combinations (m, j) of the modes of surfaces at rest, by their names; like: the model of another state
+        of the body on the same combinations, whose modes and material serve again.
         """
         if like is None:
             modes, moved = self.model.constraint.modes, np.flatnonzero(self.model.constraint.modes.any(axis=1))

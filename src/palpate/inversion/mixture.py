@@ -1,7 +1,8 @@
 """The posterior of the log-moduli: a mixture over all that may explain the later images.
 
-Under each explanation, a scenario of the tissues with the alternatives of every later image (see `scenarios`), the
-posterior is nearly normal. The probability of an explanation is its evidence, by Laplace's approximation.
+Under each explanation, a scenario of the tissues with the alternatives of every later image (see `scenarios`), all
+other unknowns are integrated out, and the posterior is nearly normal. The probability of an explanation is its
+evidence, by Laplace's approximation.
 """
 
 from __future__ import annotations
@@ -41,9 +42,9 @@ class Explanation:
     """A scenario with the alternatives of every later image, its probability, and the posterior of theta under it.
 
     chosen: numbers of the alternatives, by block; scenario, images: in words; theta (n_parameters,) and covariance
-    (n_parameters, n_parameters): of the log-moduli, normal; volume: of all other unknowns there; level: log of the
-    probability but for a constant; number: of the
-    minimum, where it has several; minimum: that of all unknowns.
+    (n_parameters, n_parameters): of the log-moduli, normal; volume: the room that theta leaves all other unknowns
+    there; level: log of the probability but for a constant; number: of the minimum, where it has several; minimum: that
+    of all unknowns with the `volume`.
     """
 
     chosen: Mapping[int, int]
@@ -123,10 +124,10 @@ def mixture_of(
 
     First every explanation is compared with the residuals linear around unknowns (n_unknowns,), within `TRUSTED_SD`
     there (see `LinearEvidence`). Then the minimum of the likeliest, `most` at most, is found on the `posterior`,
-    however far, with the evidence there. begins (n_unknowns,) each: where further minima of the likeliest explanation
-    are sought; earlier: what is known of explanations near by, where their minima are sought; narrowest: whether
-    homogeneous tissues alone are compared. Raises `EstimationError` where images and prior leave an unknown open, or no
-    minimum can be solved for.
+    however far, that of theta with all else integrated out, with the evidence there. begins (n_unknowns,) each: where
+    further minima of the likeliest explanation are sought; earlier: what is known of explanations near by, where their
+    minima are sought; narrowest: whether homogeneous tissues alone are compared. Raises `EstimationError` where images
+    and prior leave an unknown open, or no minimum can be solved for.
     """
     n = posterior.n_parameters
     with determined():
@@ -210,7 +211,8 @@ def _laplace(
 
     It is that of the marginal posterior of theta, J + 1/2 ln det H_yy with all other unknowns y at their best: that of
     J alone lies where these have most room, which soft organs leave them (Cox & Reid, J. R. Stat. Soc. B 49 (1987) 1).
-    The log-evidence is -J - 1/2 ln det H + 1/2 ln det P, H = J^T W J + P. volume: that with which it begins.
+    The log-evidence is -J - 1/2 ln det H + 1/2 ln det P, H = J^T W J + P, less what variances of theta are more than
+    the bounds of the search leave. volume: that with which it begins.
     """
     own = posterior.believing(replace(posterior.parameters.choosing(dict(of.chosen)), volume=volume))
     n, start = own.n_parameters, begin.copy()
@@ -237,7 +239,7 @@ def _laplace(
 
 
 def _beyond(there: Evaluation, bounds: Bounds) -> float:
-    """Ln of by how much variances of theta are more than its bounds leave: 1/12 of the square of their distance."""
+    """Sum of ln of by how much variances of theta are more than bounds leave: 1/12 of the square of their distance."""
     n, room = len(bounds.lower), bounds.room / np.sqrt(12.0)
     covariance = there.covariance_columns(n)[:n]
     seen = np.isfinite(np.diag(covariance)) & (room > 0.0)

@@ -23,7 +23,7 @@ from palpate.unknowns.parameters import ParameterMap
 class Linearisation:
     """One observation of one `state` at some unknowns: its residuals, robust weights (n,) and derivatives.
 
-    columns (n_columns,): the unknowns that move it, the log-moduli and its own state's coefficients. jacobian J (n,
+    columns (n_columns,): the unknowns that move it, the log-moduli and those of its own state. jacobian J (n,
     n_columns); score (n_columns,) J^T W r and information (n_columns, n_columns) J^T W J, W = precision
     diag(weights): what it adds to those of the objective.
     """
@@ -84,9 +84,10 @@ class Linearisation:
 class Evaluation:
     """Value (dimensionless, minus log-posterior) and the Gauss-Newton system.
 
-    matrix H = J^T W J + P and score (n,) = J^T W r + P (x - m) with the Jacobians J of smooth surfaces: the estimate is
-    where the score vanishes. prior: P, the precision of the unknowns before the images are seen; prior_score (n,),
-    prior_value: its part of score and value.
+    matrix H = J^T W J + P and score (n,) = J^T W r + P (x - m) + dv/dx with the Jacobians J of smooth surfaces and the
+    room v of `ParameterMap.volume`, which H is without. The estimate is where the score vanishes. prior: P, the
+    precision of the unknowns before the images are seen; prior_score (n,), prior_value: its part, and that of v, of
+    score and value.
     """
 
     value: float
@@ -132,9 +133,10 @@ class Evaluation:
 class Objective:
     """J, minus the log posterior of all unknowns x under one prior, over all observations k of all later states.
 
-    J(x) = sum_k n_k sum_j w_j rho_k(r_j(x)) / (2 s_k^2) + 1/2 (x - m)^T P (x - m), but for a constant. The unknowns x,
-    their prior mean m and precision P are those of `parameters`; scales s_k and numbers n_k of independent residuals
-    are those of the observations' `weighting`. Each observation has an offset, where `parameters` have one.
+    J(x) = sum_k n_k sum_j w_j rho_k(r_j(x)) / (2 s_k^2) + 1/2 (x - m)^T P (x - m) + v(theta), but for a constant. The
+    unknowns x, their prior mean m and precision P are those of `parameters`, and so is the room v, if any; scales s_k
+    and numbers n_k of independent residuals are those of the observations' `weighting`. Each observation has an offset,
+    where `parameters` have one.
     """
 
     states: tuple[LaterState, ...]

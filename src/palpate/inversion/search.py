@@ -122,9 +122,9 @@ def searched(
     """The search followed from where it has `begun` until the posterior's mean moves no more by the `rule`.
 
     The noise is fitted anew until steps are short, or a search goes to and fro: fitted further away, it has
-    correlations of what is still motion. Then it stays, and so does the objective. begins
-    (n_unknowns,) each: where further minima are sought. A search that does not end by its rule says so in its minimum's
-    outcome. Raises `EstimationError`s of models that cannot be solved.
+    correlations of what is still motion. Then it stays, and so does the objective. begins (n_unknowns,) each: where
+    further minima are sought. A search that does not end by its rule says so in its minimum's outcome. Raises
+    `EstimationError`s of models that cannot be solved.
     """
     now = begin if begin.mixture else _with_noise(begin)
     for number in range(1, rule.iterations + 1):

@@ -203,7 +203,8 @@ def _blocks(
 ) -> tuple[Block, ...]:
     """All that is unknown beside the moduli: of each later state its motion and its drawing, then the material.
 
-    The known modulus then, and one unknown an organ of all layers round it, as thick as they are in `body`.
+    How reference images are drawn stands between them. The known modulus then, and one unknown an organ of all layers
+    round it, as thick as they are in `body`.
     """
     blocks = list[Block]()
     for s, ((_, motion), (_, observed)) in enumerate(zip(pairs, seen, strict=True)):

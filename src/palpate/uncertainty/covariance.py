@@ -209,12 +209,13 @@ def sandwich_covariance(
 ) -> NDArray[np.float64]:
     """Covariance (n_parameters, n_parameters) of the log-moduli: H^-1 (J^T W C W J + P) H^-1.
 
-    C is the covariance of the residuals' errors under the noise model of their image (see `error_noise`), across
-    all observations of a kind; P the prior, whose uncertainty is thereby included (White 1980; Aitken's theorem
-    read for correlated errors). A residual is the error of a later image less that of its rest state's image, each
-    with half of the noise: the later ones are independent, that of the rest state is the same for all states that
-    have it, at the material place, by the mean of their noise models. Later states that move alike do not average
-    it away, opposite ones do. noise_of: the residuals' noise where it is not that of the evaluation.
+    C is the covariance of the residuals' errors under the noise model of their image (see `error_noise`), across all
+    observations of a kind; P the prior, whose uncertainty is thereby included (White 1980; Aitken's theorem read for
+    correlated errors). A residual is the error of a later image less that of its rest state's image, each with half of
+    the noise: the later ones are independent, that of the rest state is the same for all states that have it, at the
+    material place, by the mean of their noise models; none where its drawing is an unknown. Later states that move
+    alike do not average it away, opposite ones do. noise_of: the residuals' noise where it is not that of the
+    evaluation.
     """
     rows = evaluation.covariance_columns(objective.n_parameters).T
     noise, prior = _sandwich(objective, evaluation, rows, error_noise(evaluation) if noise_of is None else noise_of)

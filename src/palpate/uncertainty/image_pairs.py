@@ -1,6 +1,6 @@
 """What every image pair of a joint estimate says alone: whether they agree, which one does not, how they scatter.
 
-Pairs of one patient are not independent: later images that share a rest image share its noise and its mesh, and all
+Pairs of one patient are not independent: later images that share a rest image share its drawing and its mesh, and all
 share the prior of what they have in common. So their estimates have one covariance, and one that is joint.
 """
 
@@ -121,8 +121,8 @@ def _noise_and_prior(objective: Objective, alone: Sequence[Minimum]) -> tuple[ND
     """Covariances (n_pairs n, n_pairs n) of the estimates of each state alone by noise, and by the prior.
 
     G_s is the gain of the residuals and H_s the Gauss-Newton matrix of a state s. By noise it is G_s C_st G_t^T. Half
-    of the noise is the rest image's, which states of one reference share. By the prior it is H_s^-1 P_st H_t^-1, where
-    common unknowns count once.
+    of the noise is the rest image's, which states of one reference share, unless its drawing is an unknown. By the
+    prior it is H_s^-1 P_st H_t^-1, where common unknowns count once.
     """
     n, mapping = objective.n_parameters, objective.parameters
     size, pairs, noise = n * len(alone), [], dict[tuple[int, str], NoiseModel]()

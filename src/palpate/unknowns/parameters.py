@@ -186,7 +186,7 @@ class ParameterMap:
         return np.concatenate([self.prior_mean, *(block.mean or np.zeros(block.size) for block in self.blocks)])
 
     def prior(self, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """1/2 (x - m)^T P (x - m) + v(theta) at unknowns x (n_unknowns,), and its gradient (n_unknowns,)."""
+        """1/2 (x - m)^T P (x - m) + v(theta), v the `volume`, at unknowns x (n_unknowns,); gradient (n_unknowns,)."""
         away, n = unknowns - self.prior_centre, self.n_parameters
         pull = self.prior_matrix @ away
         value = 0.5 * float(away @ pull)
@@ -253,7 +253,7 @@ class ParameterMap:
     def unknowns_of(self, state: int) -> NDArray[np.int64]:
         """Numbers (n_own,) of the unknowns that a state depends on.
 
-        Theta, what else acts on moduli, its model's coefficients, its offsets.
+        Theta, what else acts on moduli, its model's coefficients, how its surfaces are drawn otherwise.
         """
         theta = np.arange(self.n_parameters)
         return np.concatenate([theta, self.acting_on_moduli, self._model_columns(state), self._drawing(state)])
