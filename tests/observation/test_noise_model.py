@@ -142,7 +142,7 @@ def test_the_model_does_not_hang_on_where_cells_end(rng):
 def test_far_pairs_of_large_cells_tell_what_those_of_small_cells_do(rng, monkeypatch):
     values, places, normals = residuals(rng, 0.3, 9.5)
     noise = fit_noise_model(values, places, normals)
-    monkeypatch.setattr("palpate.observation.noise_model.PAIRS", ((0, 1.0),))
+    monkeypatch.setattr("palpate.observation.noise_model.FAR_CELL", 1.0)
     every = fit_noise_model(values, places, normals)
     assert noise.sd == pytest.approx(every.sd, rel=5e-3)
     assert noise.correlation_area == pytest.approx(every.correlation_area, rel=2e-2)

@@ -34,6 +34,7 @@ FEWEST = 10  # the same, however many later images there are
 ROUNDS = 4  # over all images, to find the likeliest alternatives of each
 MINIMUM = 1e-3  # decrement at which the minimum of an explanation ends: 0.045 sd from it, as a search does
 VOLUMES, VOLUME_SD, AT_ONCE = 3, 0.1, 0.8  # searches with the room of all others, its accuracy in sd, ln E a search
+HELD_SD = 0.01  # of ln E: what acts on moduli and is known better stays where it is
 DIFFERENCE = 0.05  # of ln E: step of derivatives of that room
 
 
@@ -233,7 +234,8 @@ def _laplace(
         return None
     parameters = own.parameters
     determinants = sum(of.log_determinant for of in parameters.priors) - log_det(there.matrix) - _beyond(there, bounds)
-    added = 0.0 if parameters.volume is None else parameters.volume.at(theta)[0]
+    room = parameters.volume
+    added = 0.0 if room is None else room.at(room.of(minimum.unknowns))[0]
     level = of.log_prior + of.several + 0.5 * determinants - (there.value - added)
     return _Laplace(of, minimum, parameters.volume, level)
 
@@ -248,19 +250,23 @@ def _beyond(there: Evaluation, bounds: Bounds) -> float:
 
 
 def _volume(posterior: Posterior, minimum: Minimum) -> Volume:
-    """How 1/2 ln det H_yy changes with theta at a minimum, by differences."""
-    n, others = posterior.n_parameters, np.arange(len(minimum.unknowns)) >= posterior.n_parameters
+    """How 1/2 ln det H_yy changes with theta, and what else acts on moduli, at a minimum, by differences."""
+    n, parameters, at = posterior.n_parameters, posterior.parameters, minimum.unknowns
+    free = minimum.evaluation.prior.diagonal[parameters.acting_on_moduli] < HELD_SD**-2.0
+    numbers = parameters.acting_on_moduli[free]
+    moved = np.concatenate([np.arange(n), numbers])
+    others = ~np.isin(np.arange(len(at)), moved)
 
     def room(matrix: Arrowhead) -> float:
         """1/2 ln det H_yy."""
         return 0.5 * log_det(matrix.among(others))
 
-    here, slope = room(minimum.evaluation.matrix), np.zeros(n)
-    for i in range(n):
-        there = minimum.unknowns.copy()
-        there[i] += DIFFERENCE
+    here, slope = room(minimum.evaluation.matrix), np.zeros(len(moved))
+    for i, number in enumerate(moved):
+        there = at.copy()
+        there[number] += DIFFERENCE
         slope[i] = (room(posterior(there).matrix) - here) / DIFFERENCE
-    return Volume(slope, minimum.unknowns[:n])
+    return Volume(slope, at[moved], numbers)
 
 
 def log_det(matrix: Arrowhead) -> float:

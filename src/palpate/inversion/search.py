@@ -56,9 +56,9 @@ class Searched:
     """Where a search is: the objective, all unknowns with their evaluation, and the posterior as it is known there.
 
     The evaluation is that under the likeliest explanation. mixture: None before the first iteration. settled: whether
-    the noise is fitted, after which the objective stays as it is. fits: number of iterations. moved: by how many of its
-    standard deviations the mean moved last; led: theta (n_parameters,) of the last iterations near by, and the mean
-    (n_parameters,) found from each.
+    the noise is fitted, after which the objective stays as it is; fits, stayed: number of all iterations, and of those
+    since. moved: by how many of its standard deviations the mean moved last; led: theta (n_parameters,) of the last
+    iterations near by, and the mean (n_parameters,) found from each.
     """
 
     objective: Objective
@@ -66,6 +66,7 @@ class Searched:
     mixture: Mixture | None = None
     settled: bool = False
     fits: int = 0
+    stayed: int = 0
     moved: float = np.inf
     led: tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...] = ()
 
@@ -168,16 +169,28 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     )
     objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
-    moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
+    nothing = (sd > bounds.room / np.sqrt(12.0)) & (bounds.room > 2.0 * RADIUS)  # is told by a mean as wide as these
+    mean = np.where(nothing, theta, mixture.mean)
+    moved = float(np.max(np.abs(mean - theta) / sd, initial=0.0))
+    share = 1.0 / max(now.stayed - PATIENCE, 1)  # evidence that changes with the place leads round in circles else
     near_end = now.moved < LAST_FIT or (exact and now.fits >= PATIENCE)
     settled = now.settled or (near_end and _change(now.objective, objective) < CALM)
-    before = replace(now, objective=objective, mixture=mixture, moved=moved, settled=settled, fits=now.fits + 1)
-    if (settled if rule.step_sd < LAST_FIT else exact) and moved < rule.step_sd:
+    before = replace(
+        now,
+        objective=objective,
+        mixture=mixture,
+        moved=moved,
+        settled=settled,
+        fits=now.fits + 1,
+        stayed=now.stayed + settled,
+    )
+    if (settled if rule.step_sd < LAST_FIT else exact) and share * moved < rule.step_sd:
         evaluation = evaluation.under(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
         return replace(before, minimum=minimum, settled=True)
-    led = (*(now.led[-MEMORY:] if exact else ()), (theta, mixture.mean))
-    target = _target(posterior, objective, mixture, np.clip(_fixed_point(led, sd), near.lower, near.upper))
+    led = (*(now.led[-MEMORY:] if exact else ()), (theta, mean))
+    goal = _fixed_point(led, sd) if share == 1.0 else theta + share * (mean - theta)
+    target = _target(posterior, objective, mixture, np.clip(goal, near.lower, near.upper))
     return _taken(replace(before, led=led), evaluation, target)
 
 

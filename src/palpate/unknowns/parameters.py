@@ -62,18 +62,24 @@ class _Layout:
 
 @dataclass(frozen=True, slots=True)
 class Volume:
-    """How much room theta leaves all other unknowns, v = 1/2 ln det H_yy of their Gauss-Newton matrix, near a place.
+    """How much room moduli leave all other unknowns, v = 1/2 ln det H_yy of their Gauss-Newton matrix, near a place.
 
-    v(theta) = sum_i g_i l tanh((theta_i - c_i) / l) with the slope g (n_parameters,) at c (n_parameters,), l =
-    `LEVELS_OFF`: where an organ is so stiff, or so soft, that its modulus hardly matters, the room stays as it is.
+    v(x) = sum_i g_i l tanh((x_i - c_i) / l) with the slope g (m,) at c (m,), l = `LEVELS_OFF`: where an organ is so
+    stiff, or so soft, that its modulus hardly matters, the room stays as it is. x: theta, then unknowns with these
+    `numbers` (m - n_parameters,) that act on moduli, too.
     """
 
     slope: NDArray[np.float64]
     centre: NDArray[np.float64]
+    numbers: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
-    def at(self, theta: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """V at theta (n_parameters,), and its derivatives (n_parameters,)."""
-        away = np.tanh((theta - self.centre) / LEVELS_OFF)
+    def of(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """X (m,) of all unknowns (n_unknowns,)."""
+        return np.concatenate([unknowns[: len(self.slope) - len(self.numbers)], unknowns[self.numbers]])
+
+    def at(self, x: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """V at x (m,), and its derivatives (m,)."""
+        away = np.tanh((x - self.centre) / LEVELS_OFF)
         return float(LEVELS_OFF * self.slope @ away), np.asarray(self.slope * (1.0 - away**2))
 
 
@@ -191,8 +197,9 @@ class ParameterMap:
         pull = self.prior_matrix @ away
         value = 0.5 * float(away @ pull)
         if self.volume is not None:
-            added, slope = self.volume.at(unknowns[:n])
-            value, pull[:n] = value + added, pull[:n] + slope
+            added, slope = self.volume.at(self.volume.of(unknowns))
+            value, pull[:n] = value + added, pull[:n] + slope[:n]
+            pull[self.volume.numbers] += slope[n:]
         return value, pull
 
     def moduli(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -277,7 +284,9 @@ class ParameterMap:
         kept = [i for i, block in enumerate(self.blocks) if state in block.states]
         blocks = tuple(replace(self.blocks[i], states=(0,)) for i in kept)
         own = np.concatenate([np.arange(self.n_parameters), *(self.columns(i) for i in kept)])
-        share = self.volume and replace(self.volume, slope=self.volume.slope / self.n_states)
+        share = self.volume
+        if share is not None:
+            share = replace(share, slope=share.slope / self.n_states, numbers=np.searchsorted(own, share.numbers))
         return replace(self, blocks=blocks, priors=tuple(self.priors[i] for i in kept), volume=share), own
 
     def _model_columns(self, state: int) -> NDArray[np.int64]:
