@@ -222,7 +222,8 @@ def _laplace(
         minimum = gauss_newton(own, start, bounds=bounds, tolerance=MINIMUM)
         for _ in range(VOLUMES if own.parameters.n_coefficients else 0):
             theta, sd = minimum.unknowns[:n], posterior_sd(minimum, n)
-            own = own.believing(replace(own.parameters, volume=_volume(own, minimum)))
+            open_ = sd > bounds.room / np.sqrt(12.0)  # on such a plain any slope would lead to a bound
+            own = own.believing(replace(own.parameters, volume=_volume(own, minimum, np.flatnonzero(~open_))))
             within = bounds.around(theta, AT_ONCE)
             minimum = gauss_newton(own, minimum.unknowns, bounds=within, tolerance=MINIMUM)
             if np.all(np.abs(minimum.unknowns[:n] - theta) < VOLUME_SD * sd):
@@ -249,8 +250,11 @@ def _beyond(there: Evaluation, bounds: Bounds) -> float:
     return float(np.log(np.maximum(variances, 1.0)).sum())
 
 
-def _volume(posterior: Posterior, minimum: Minimum) -> Volume:
-    """How 1/2 ln det H_yy changes with theta, and what else acts on moduli, at a minimum, by differences."""
+def _volume(posterior: Posterior, minimum: Minimum, told: NDArray[np.int64]) -> Volume:
+    """How 1/2 ln det H_yy changes with the log-moduli that are `told`, and what else acts on moduli, at a minimum.
+
+    By differences.
+    """
     n, parameters, at = posterior.n_parameters, posterior.parameters, minimum.unknowns
     free = minimum.evaluation.prior.diagonal[parameters.acting_on_moduli] < HELD_SD**-2.0
     numbers = parameters.acting_on_moduli[free]
@@ -262,9 +266,9 @@ def _volume(posterior: Posterior, minimum: Minimum) -> Volume:
         return 0.5 * log_det(matrix.among(others))
 
     here, slope = room(minimum.evaluation.matrix), np.zeros(len(moved))
-    for i, number in enumerate(moved):
+    for i in (*told.tolist(), *range(n, len(moved))):
         there = at.copy()
-        there[number] += DIFFERENCE
+        there[moved[i]] += DIFFERENCE
         slope[i] = (room(posterior(there).matrix) - here) / DIFFERENCE
     return Volume(slope, at[moved], numbers)
 

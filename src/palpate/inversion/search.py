@@ -169,9 +169,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     )
     objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
-    nothing = (sd > bounds.room / np.sqrt(12.0)) & (bounds.room > 2.0 * RADIUS)  # is told by a mean as wide as these
-    mean = np.where(nothing, theta, mixture.mean)
-    moved = float(np.max(np.abs(mean - theta) / sd, initial=0.0))
+    moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
     share = 1.0 / max(now.stayed - PATIENCE, 1)  # evidence that changes with the place leads round in circles else
     near_end = now.moved < LAST_FIT or (exact and now.fits >= PATIENCE)
     settled = now.settled or (near_end and _change(now.objective, objective) < CALM)
@@ -188,8 +186,8 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         evaluation = evaluation.under(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
         return replace(before, minimum=minimum, settled=True)
-    led = (*(now.led[-MEMORY:] if exact else ()), (theta, mean))
-    goal = _fixed_point(led, sd) if share == 1.0 else theta + share * (mean - theta)
+    led = (*(now.led[-MEMORY:] if exact else ()), (theta, mixture.mean))
+    goal = _fixed_point(led, sd) if share == 1.0 else theta + share * (mixture.mean - theta)
     target = _target(posterior, objective, mixture, np.clip(goal, near.lower, near.upper))
     return _taken(replace(before, led=led), evaluation, target)
 
