@@ -208,6 +208,19 @@ def test_too_few_iterations_are_not_called_convergence(patients, bent):
     assert found.mixture.weights.sum() == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(("away", "outcome"), [(0.02, Outcome.CONVERGED), (0.3, Outcome.CIRCLED), (0.8, Outcome.STEPS)])
+def test_a_long_search_ends_where_its_mean_nearly_stays_and_says_when_it_went_in_circles(patients, bent, away, outcome):
+    """By how far the mean lies from the place, in standard deviations, and not by how short the last step is."""
+    end = way(patients, begin(bent[1]))[-1]
+    place = end.minimum.unknowns.copy()
+    place[:2] = end.posterior.mean + away * sd_of(end.posterior)
+    there = replace(begun(end.objective, place), mixture=end.mixture, settled=True, stayed=60, moved=away)
+    after = one_more(patients, there)
+    assert after.moved == pytest.approx(away, abs=0.05)
+    assert after.minimum.outcome is outcome
+    assert after.minimum.converged == (away < 0.5)
+
+
 def test_bounds_hold_on_the_way_and_at_the_end(patients, bent):
     narrow = replace(patients.settings(), bounds=Bounds(np.full(2, -0.1), np.full(2, 0.1)))
     found = invert(bent[1], narrow, progress=silent)

@@ -66,7 +66,7 @@ def codes(estimation):
 def one_explanation(minimum, n=2):
     """The mixture of one explanation of the images, that of a minimum."""
     covariance = minimum.evaluation.covariance_columns(n)[:n]
-    return Mixture((Explanation({}, (), ((),), 1.0, minimum.unknowns[:n], covariance),), minimum)
+    return Mixture((Explanation({}, (), ((),), 1.0, minimum.unknowns[:n], covariance, minimum),))
 
 
 def spoilt(inversion, outcome, starts=(0, 1)):

@@ -134,10 +134,10 @@ POSTERIOR = np.array([[0.04, 0.01], [0.01, 0.02]])
 def explained(*told):
     """The mixture of explanations by their chosen alternatives, weights and log-moduli, of one covariance."""
     every = tuple(
-        Explanation(dict(enumerate(chosen)), (), ((),), weight, np.array(theta), POSTERIOR)
+        Explanation(dict(enumerate(chosen)), (), ((),), weight, np.array(theta), POSTERIOR, None)
         for chosen, weight, theta in told
     )
-    return Mixture(every, None)
+    return Mixture(every)
 
 
 def causes(*, grown=1.0, held=0.003):
@@ -201,7 +201,7 @@ def test_a_scenario_under_which_less_is_known_is_told_by_it():
     """Layers, with a probability of 0.3, under which the variance of the first log-modulus is 0.1 larger."""
     (bonded,) = explained(ALONE).explanations
     wide = replace(bonded, chosen={0: 0, 1: 1, 2: 0}, weight=0.3, covariance=POSTERIOR + np.diag([0.1, 0.0]))
-    found, own = stated_mixture(Mixture((replace(bonded, weight=0.7), wide), None), causes(), BLOCKS), causes()
+    found, own = stated_mixture(Mixture((replace(bonded, weight=0.7), wide)), causes(), BLOCKS), causes()
     assert found.covariance.total == pytest.approx(own.total + np.diag([0.03, 0.0]))
     whole = found.covariance.total[0, 0]
     assert found.covariance.shares(0)["layer"] * whole == pytest.approx(own.shares(0)["layer"] * own.total[0, 0] + 0.03)

@@ -43,9 +43,9 @@ class Explanation:
     """A scenario with the alternatives of every later image, its probability, and the posterior of theta under it.
 
     chosen: numbers of the alternatives, by block; scenario, images: in words; theta (n_parameters,) and covariance
-    (n_parameters, n_parameters): of the log-moduli, normal; volume: the room that theta leaves all other unknowns
-    there; level: log of the probability but for a constant; number: of the minimum, where it has several; minimum: that
-    of all unknowns with the `volume`.
+    (n_parameters, n_parameters): of the log-moduli, normal; minimum: that of all unknowns with the `volume`, the room
+    that theta leaves all others there; level: log of the probability but for a constant; number: of the minimum, where
+    it has several.
     """
 
     chosen: Mapping[int, int]
@@ -54,10 +54,10 @@ class Explanation:
     weight: float
     theta: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    minimum: Minimum = field(repr=False)
     volume: Volume | None = None
     level: float = 0.0
     number: int = 0
-    minimum: Minimum | None = field(default=None, repr=False)
 
     @property
     def key(self) -> tuple[int, tuple[tuple[int, int], ...]]:
@@ -71,13 +71,14 @@ class Explanation:
 
 @dataclass(frozen=True, slots=True)
 class Mixture:
-    """The posterior of theta: explanations with their weights, the likeliest first, which add up to 1.
-
-    minimum: that of the likeliest one, of all unknowns.
-    """
+    """The posterior of theta: explanations with their weights, the likeliest first, which add up to 1."""
 
     explanations: tuple[Explanation, ...]
-    minimum: Minimum = field(repr=False)
+
+    @property
+    def minimum(self) -> Minimum:
+        """That of the likeliest explanation, of all unknowns."""
+        return self.explanations[0].minimum
 
     @property
     def weights(self) -> NDArray[np.float64]:
@@ -133,42 +134,34 @@ def mixture_of(
     n = posterior.n_parameters
     with determined():
         compared = LinearEvidence.of(posterior.parameters, evaluation, unknowns).compared(most, narrowest=narrowest)
-    known = {of.key: of for of in (earlier.explanations if earlier else ())}
-    jobs = [(of, known.get((0, tuple(sorted(of.chosen))))) for of in compared]
-    found = [each for each in mapped(lambda job: _minimum_of(posterior, *job, bounds), jobs) if each is not None]
+    known = {of.key: (of.minimum.unknowns, of.volume) for of in (earlier.explanations if earlier else ())}
+    jobs = [(of, *known.get((0, tuple(sorted(of.chosen))), (of.unknowns, None))) for of in compared]
+    found = [each for each in mapped(lambda job: _laplace(posterior, bounds, *job), jobs) if each is not None]
     if not found:
         raise EstimationError("the model cannot be solved near any explanation of the images; check images and mesh")
     likeliest = max(found, key=lambda each: each.level)
-    for each in mapped(lambda begin: _laplace(posterior, likeliest.of, begin, bounds), begins):
+    for each in mapped(lambda begin: _laplace(posterior, bounds, likeliest.of, begin), begins):
         others = [other.minimum for other in found if other.of is likeliest.of]
         if each is not None and not any(same_minimum(each.minimum.unknowns, other, n) for other in others):
             found.append(each)
+    weights = np.exp([each.level - likeliest.level for each in found])
     explanations = [
         Explanation(
             dict(each.of.chosen),
             each.of.scenario,
             each.of.images,
-            0.0,
+            float(weights[i] / weights.sum()),
             each.minimum.unknowns[:n],
             each.minimum.evaluation.covariance_columns(n)[:n],
+            each.minimum,
             each.volume,
             each.level,
             sum(other.of is each.of for other in found[:i]),
-            each.minimum,
         )
         for i, each in enumerate(found)
+        if weights[i] > 0.0
     ]
-    return _weighed(explanations)
-
-
-def _weighed(explanations: Sequence[Explanation]) -> Mixture:
-    """The mixture of explanations by their levels; those of no weight are left out."""
-    ordered = sorted(explanations, key=lambda of: -of.level)
-    weights = np.exp([of.level - ordered[0].level for of in ordered])
-    kept = [replace(of, weight=w / weights.sum()) for of, w in zip(ordered, weights.tolist(), strict=True) if w > 0.0]
-    minimum = kept[0].minimum
-    assert minimum is not None, "explanations of a search have minima"
-    return Mixture(tuple(kept), minimum)
+    return Mixture(tuple(sorted(explanations, key=lambda of: -of.level)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,15 +191,8 @@ class _Laplace:
     level: float
 
 
-def _minimum_of(posterior: Posterior, of: _Compared, known: Explanation | None, bounds: Bounds) -> _Laplace | None:
-    """An explanation's minimum, sought from where it is `known` to be near by, else from that on linear residuals."""
-    if known is None or known.minimum is None:
-        return _laplace(posterior, of, of.unknowns, bounds)
-    return _laplace(posterior, of, known.minimum.unknowns, bounds, known.volume)
-
-
 def _laplace(
-    posterior: Posterior, of: _Compared, begin: NDArray[np.float64], bounds: Bounds, volume: Volume | None = None
+    posterior: Posterior, bounds: Bounds, of: _Compared, begin: NDArray[np.float64], volume: Volume | None = None
 ) -> _Laplace | None:
     """An explanation's minimum, sought from unknowns (n_unknowns,); None where the model cannot be solved there.
 

@@ -32,6 +32,7 @@ WORSE = 2.0  # rise of J at which a step is halved: closest points that slide ov
 FLOOR = 1e-4  # of ln E: a move that is always short enough
 LAST_FIT = 0.3  # standard deviations that the mean moved: so near, the noise is fitted for the last time
 PATIENCE = 3  # iterations after which it is where a step was no longer than one: a search may go to and fro by more
+CIRCLE = 0.5  # standard deviations that the mean may move by where a search that went round in circles ends
 MEMORY, DEPENDENT = 2, 1e-2  # earlier iterations that count; relative size of ways that count as dependent
 CALM = 0.8  # of ln of what residuals weigh: a change with which the noise still follows the search
 
@@ -124,7 +125,8 @@ def searched(
 
     The noise is fitted anew until steps are short, or a search goes to and fro: fitted further away, it has
     correlations of what is still motion. Then it stays, and so does the objective. begins (n_unknowns,) each: where
-    further minima are sought. A search that does not end by its rule says so in its minimum's outcome. Raises
+    further minima are sought. One that goes round in circles goes a share of the way that falls, and ends in their
+    middle; it says so in its minimum's outcome, as one that does not end by its rule does. Raises
     `EstimationError`s of models that cannot be solved.
     """
     now = begin if begin.mixture else _with_noise(begin)
@@ -182,9 +184,10 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         fits=now.fits + 1,
         stayed=now.stayed + settled,
     )
-    if (settled if rule.step_sd < LAST_FIT else exact) and share * moved < rule.step_sd:
-        evaluation = evaluation.under(objective.parameters, at.unknowns)
-        minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
+    stays, circles = moved < rule.step_sd, share * moved < rule.step_sd and moved < CIRCLE
+    if (settled if rule.step_sd < LAST_FIT else exact) and (stays or circles):
+        evaluation, outcome = evaluation.under(objective.parameters, at.unknowns), Outcome.CIRCLED
+        minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED if stays else outcome)
         return replace(before, minimum=minimum, settled=True)
     led = (*(now.led[-MEMORY:] if exact else ()), (theta, mixture.mean))
     goal = _fixed_point(led, sd) if share == 1.0 else theta + share * (mixture.mean - theta)
