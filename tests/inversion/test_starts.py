@@ -39,8 +39,9 @@ def with_every_unknown(twins, problem):
     begin = np.concatenate([twins.settings(2.0).centre, np.zeros(problem.parameters.n_coefficients)])
     (state,) = problem.states
     moduli = problem.parameters.moduli(begin)
-    responses = state.model.system(moduli).material_responses(state.model.solve(moduli, begin[2:]).values)
-    basis = reduced_basis(state.model, moduli).with_material(responses, moduli)
+    values = state.model.solve(moduli, begin[2:]).values
+    responses = state.model.system(moduli).material_responses(values)
+    basis = reduced_basis(state.model, moduli).with_material(responses, moduli, values)
     states = (state.with_approximation(basis),)
     return invert(replace(problem, states=states), twins.settings(2.0), progress=twins.silent)
 

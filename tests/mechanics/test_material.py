@@ -166,8 +166,8 @@ def test_a_reduced_basis_tells_what_its_responses_to_the_material_miss_elsewhere
     there = LinearisationPoint(moduli, np.concatenate([boundary, material]))
     homogeneous = LinearisationPoint(moduli, np.concatenate([boundary, 0.0 * material]))
     first = reduced_basis(model, MODULI)
-    responses = first.system.material_responses(model.solve(MODULI, homogeneous.coefficients).values)
-    first = first.with_material(responses, MODULI)
+    values = model.solve(MODULI, homogeneous.coefficients).values
+    first = first.with_material(first.system.material_responses(values), MODULI, values)
     basis = first.update(homogeneous)
     missing = model.solve(moduli, there.coefficients).values - basis.model.solve(moduli, there.coefficients).values
     assert basis.error(homogeneous).relative < 1e-5
@@ -178,7 +178,8 @@ def test_an_updated_reduced_basis_misses_nothing_of_what_follows_the_material(bo
     """Where it was updated: the material's coefficients there are no combination of the directions that decide."""
     model, every = linear_model(*body, material=modes), np.concatenate(coefficients)
     first = reduced_basis(model, MODULI)
-    first = first.with_material(first.system.material_responses(model.solve(MODULI, every).values), MODULI)
+    values = model.solve(MODULI, np.concatenate([coefficients[0], 0.0 * coefficients[1]])).values
+    first = first.with_material(first.system.material_responses(values), MODULI, values)
     n = model.n_regions + len(every)
     directions = rng.normal(size=(n, 2))
     at = LinearisationPoint(MODULI * [1.2, 1.0], every, directions, np.eye(n))
@@ -193,7 +194,8 @@ def test_an_updated_reduced_basis_misses_nothing_of_what_follows_the_material(bo
 def test_responses_to_the_material_are_made_anew_far_away_without_another_factorisation(body, modes, coefficients, rng):
     model, every = linear_model(*body, material=modes), np.concatenate(coefficients)
     first = reduced_basis(model, MODULI)
-    first = first.with_material(first.system.material_responses(model.solve(MODULI, every).values), MODULI)
+    values = model.solve(MODULI, np.concatenate([coefficients[0], 0.0 * coefficients[1]])).values
+    first = first.with_material(first.system.material_responses(values), MODULI, values)
     moduli, n, column = MODULI * [2.0, 1.0], model.n_regions + len(every), model.n_regions + body[1].n_modes
     basis = first.update(LinearisationPoint(moduli, every, rng.normal(size=(n, 2)), np.eye(n)))
     homogeneous = np.concatenate([coefficients[0], 0.0 * coefficients[1]])
@@ -209,7 +211,8 @@ def test_far_away_what_decides_is_exact_where_no_response_to_every_material_mode
     """Those of the directions alone, at the material's coefficients there."""
     model, every = linear_model(*body, material=modes), np.concatenate(coefficients)
     first = reduced_basis(model, MODULI)
-    first = first.with_material(first.system.material_responses(model.solve(MODULI, every).values), MODULI)
+    values = model.solve(MODULI, np.concatenate([coefficients[0], 0.0 * coefficients[1]])).values
+    first = first.with_material(first.system.material_responses(values), MODULI, values)
     moduli, n, boundary = MODULI * [2.0, 1.0], model.n_regions + len(every), model.n_regions + body[1].n_modes
     directions = rng.normal(size=(n, 2))
     basis = first.update(LinearisationPoint(moduli, every, directions, np.eye(n), all_material=False))

@@ -159,7 +159,6 @@ def test_a_projection_serves_another_state_of_the_body_on_the_same_vectors(model
     there, anew = first.under(other), projection(other, vectors)
     assert there.reduced.output_basis[0] is first.reduced.output_basis[0]
     assert there.reduced.solve(moduli, q).values == pytest.approx(anew.reduced.solve(moduli, q).values, abs=1e-9)
-    assert first.under(model.under(model.conditions)).reduced is first.reduced
 
 
 def test_states_of_a_body_with_vectors_of_their_own_share_what_is_common_of_the_factor(model):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate.approximation.contract import LinearisationPoint, ModelError, determined
+from palpate.approximation.contract import LinearisationPoint, ModelError
 from palpate.mechanics.forward import SolveCounts
 from palpate.mechanics.linear_model import LinearModel, LinearSystem
 from palpate.mechanics.reduced import Projection, ReducedModel, projection
@@ -39,7 +39,7 @@ class ReducedBasis:
     """A linear model projected on m displacements (n_free, m); implements `Approximation`.
 
     system: the last factorised one; counts: what it cost; place: where it was last made exact, None: nowhere yet;
-    material_at (n_regions,) kPa: where all responses to the material modes were made, (0,) where none were yet.
+    material_at (n_regions,) kPa: where all responses to the material modes were made last, (0,) where none were yet.
     """
 
     projection: Projection
@@ -123,12 +123,25 @@ class ReducedBasis:
         if not np.any(material):
             return ModelError(*self.system.error_bound(at.moduli, displacement))
         forces = model.material_forces(at.moduli, displacement, material)
-        whole = displacement + (self.model.output_material @ material)[:, 0]
+        whole = self.model.solve(at.moduli, at.coefficients).values
         return ModelError(*self.system.error_bound(at.moduli, whole, np.asarray(model.constraint.free.T @ forces)))
 
-    def with_material(self, responses: NDArray[np.floating[Any]], moduli: NDArray[np.float64]) -> ReducedBasis:
-        """With the responses (n_dof, n_material) mm to the material modes at moduli (n_regions,) kPa."""
-        return replace(self, projection=self.projection.with_material(responses), material_at=moduli)
+    def with_material(
+        self, responses: NDArray[np.floating[Any]], moduli: NDArray[np.float64], values: NDArray[np.float64]
+    ) -> ReducedBasis:
+        """With the responses (n_dof, n_material) mm to the material modes at moduli (n_regions,) kPa.
+
+        values (n_dof,) mm: the displacement there of homogeneous tissues. Elsewhere the responses follow the moduli as
+        the projection tells, for what the modes do to that displacement.
+        """
+        found = self.projection.at_displacement(values)
+        fresh = np.asarray(self.constraint.free.T @ responses, dtype=np.float64)
+        return replace(self, projection=found.extended(fresh), material_at=moduli)
+
+    def at_place(self) -> ReducedBasis:
+        """With the forces of material modes at its place."""
+        assert self.place is not None, "a basis is at a place once it is made exact there"
+        return replace(self, projection=self.projection.at_displacement(self.homogeneous(self.place)))
 
     def stale(self, at: LinearisationPoint) -> bool:
         """Whether responses to the material modes are not there yet, or of far from a place that asks for them all."""
@@ -180,81 +193,43 @@ class ReducedBasis:
 
 
 @dataclass(frozen=True, slots=True)
-class _Directions:
-    """Those of (ln E, boundary modes) (n_regions + n_boundary, k), and of material modes (n_material, l).
-
-    Along the latter, all of them or those of the place, the coefficients there are one, too: of their part of the
-    displacement nothing is missed then.
-    """
-
-    boundary: NDArray[np.float64]
-    material: NDArray[np.float64]
-
-    @classmethod
-    def at(cls, place: LinearisationPoint, model: LinearModel, *, every: bool) -> _Directions:
-        """The directions of a place, none where it has none; every: with all material modes."""
-        first, modes = model.n_regions + model.constraint.n_modes, np.zeros((model.material.n_modes, 0))
-        if place.directions is None:
-            return cls(np.zeros((first, 0)), modes)
-        if every:
-            modes = np.eye(len(modes))
-        elif place.metric is not None and len(modes):
-            modes = np.column_stack([place.directions[first:], place.coefficients[model.constraint.n_modes :]])
-            modes = modes[:, np.linalg.norm(modes, axis=0) > 0.0]
-        return cls(place.directions[:first], modes)
-
-    @property
-    def number(self) -> int:
-        """How many they are."""
-        return int(self.boundary.shape[1] + self.material.shape[1])
-
-    def by_displacement(self, model: LinearModel) -> _Directions:
-        """Those along which loads depend on the displacement."""
-        of_moduli = np.arange(len(self.boundary))[:, None] < model.n_regions
-        return replace(self, boundary=np.where(of_moduli, self.boundary, 0.0))
-
-    def loads(
-        self, model: LinearModel, moduli: NDArray[np.float64], displacement: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Loads (n_free, k + l), mN, of the derivatives at moduli (n_regions,) kPa and u (n_dof,) mm."""
-        loads = model.boundary_loads(moduli, displacement, self.boundary)
-        if not self.material.shape[1]:
-            return loads
-        forces = model.material_forces(moduli, displacement, self.material)
-        return np.concatenate([loads, -np.asarray(model.constraint.free.T @ forces)], axis=1)
-
-
-@dataclass(frozen=True, slots=True)
 class _Missing:
-    """What a basis is asked for at a place: the displacement, and derivatives along directions.
+    """What a basis is asked for at a place: the displacement, and derivatives along directions of (ln E, coefficients).
 
-    every: by all material modes; displacement (n_dof,) mm: that of the reduced model, of homogeneous tissues; new: 1
-    where the displacement is sought, too, else 0.
+    along (n_regions + n_modes, k): the directions, and the material's coefficients there; every: whether derivatives by
+    all material modes are among them; displacement (n_dof,) mm: that of the reduced model, of homogeneous tissues; new:
+    1 where the displacement is sought, too, else 0.
     """
 
     basis: ReducedBasis
     at: LinearisationPoint
     every: bool
-    along: _Directions
+    along: NDArray[np.float64]
     displacement: NDArray[np.float64]
     new: int
 
     @classmethod
     def of(cls, basis: ReducedBasis, at: LinearisationPoint) -> _Missing:
         """What it is of a basis at a place."""
-        every = at.directions is not None and basis.stale(at)
-        along = _Directions.at(at, basis.full_model, every=every)
+        model, every = basis.full_model, at.directions is not None and basis.stale(at)
+        first, size = len(at.moduli) + model.constraint.n_modes, len(at.moduli) + model.n_modes
+        along = np.zeros((size, 0))
+        if every and at.directions is not None:
+            along = np.concatenate([at.directions, np.eye(size)[:, first:]], axis=1)
+        elif at.directions is not None:
+            own = np.concatenate([np.zeros(first), at.coefficients[model.constraint.n_modes :]])[:, None]
+            along = np.concatenate([at.directions, own[:, own.any(axis=0)]], axis=1)
         return cls(basis, at, every, along, basis.homogeneous(at), int(not at.same_as(basis.place)))
 
     @property
     def number(self) -> int:
         """How many right-hand sides it takes."""
-        return self.new + self.along.number
+        return self.new + self.along.shape[1]
 
     @property
     def tolerances(self) -> list[float]:
         """The relative residual of each."""
-        return [DISPLACEMENT] * self.new + [TANGENT] * self.along.number
+        return [DISPLACEMENT] * self.new + [TANGENT] * self.along.shape[1]
 
     def alike(self, other: _Missing) -> bool:
         """Whether another one is of the same matrix."""
@@ -266,46 +241,65 @@ class _Missing:
 
         product: with the stiffness at the place, to have only what the derivatives that are there leave of theirs.
         """
-        model, moduli, displacement, along = self.basis.full_model, self.at.moduli, self.displacement, self.along
+        model, moduli, displacement = self.basis.full_model, self.at.moduli, self.displacement
         sought = -model.residual(moduli, displacement[:, None])[:, : self.new]
-        if not along.number:
+        if not self.along.shape[1]:
             return sought
-        loads, first = along.loads(model, moduli, displacement), along.boundary.shape[1]
-        if product is not None:
-            projection = self.basis.projection
-            amplitudes = projection.reduced.system(moduli).backward(projection.components(loads[:, :first]))
-            loads -= product(np.concatenate([projection.spanned(amplitudes), self.known], axis=1))
-        return np.concatenate([sought, loads], axis=1)
-
-    @property
-    def known(self) -> NDArray[np.float64]:
-        """The responses (n_free, k) mm that are there, along the directions of the material."""
-        free, responses = self.basis.constraint.free, self.basis.model.output_material
-        return np.asarray(free.T @ (responses if self.every else responses @ self.along.material), dtype=np.float64)
+        boundary = self.along[: len(moduli) + model.constraint.n_modes]
+        loads = model.boundary_loads(moduli, self._whole(displacement), boundary) + self._material_loads(displacement)
+        return np.concatenate([sought, loads if product is None else loads - product(self._within(loads))], axis=1)
 
     def further_loads(self, missing: NDArray[np.float64]) -> NDArray[np.float64]:
         """Loads (n_free, k), mN, of derivatives of what was `missing` (n_free, number) mm of the displacement.
 
         None where that is a small share.
         """
-        late = np.asarray(self.basis.constraint.free @ missing[:, : self.new])
-        if self.along.number and np.linalg.norm(late) > FAR_OFF * np.linalg.norm(self.displacement):
-            model = self.basis.full_model
-            return self.along.by_displacement(model).loads(model, self.at.moduli, late[:, 0])
-        return missing[:, :0]
+        model, n = self.basis.full_model, len(self.at.moduli)
+        late = np.asarray(model.constraint.free @ missing[:, : self.new])
+        if not self.along.shape[1] or np.linalg.norm(late) <= FAR_OFF * np.linalg.norm(self.displacement):
+            return missing[:, :0]
+        boundary = self.along[: n + model.constraint.n_modes].copy()
+        boundary[n:] = 0.0  # what boundary modes do does not depend on the displacement
+        loads = model.boundary_loads(self.at.moduli, self._whole(late[:, 0]), boundary)
+        return loads + self._material_loads(late[:, 0])
+
+    def _whole(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A displacement (n_dof,) mm of homogeneous tissues with what follows from the material at the place."""
+        material = self.at.coefficients[self.basis.constraint.n_modes :, None]
+        if not np.any(material):
+            return displacement
+        model = self.basis.full_model
+        forces = model.material_forces(self.at.moduli, displacement, material)
+        within = self._within(-np.asarray(model.constraint.free.T @ forces))
+        return displacement + np.asarray(model.constraint.free @ within)[:, 0]
+
+    def _material_loads(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Loads (n_free, k), mN, of derivatives by the material modes, and of these by ln E, at u (n_dof,) mm."""
+        model, moduli = self.basis.full_model, self.at.moduli
+        n, first, free = len(moduli), len(moduli) + model.constraint.n_modes, model.constraint.free
+        if first == len(self.along):
+            return np.zeros((free.shape[1], self.along.shape[1]))
+        forces = model.material_forces(moduli, displacement, self.along[first:])
+        material = self.at.coefficients[first - n :]
+        if np.any(material) and np.any(self.along[:n]):  # forces of a region are as large as its modulus
+            own = zip(model.material_by_region(displacement), moduli, strict=True)
+            forces += np.concatenate([of.along(e * material[:, None]) for of, e in own], axis=1) @ self.along[:n]
+        return -np.asarray(free.T @ forces)
+
+    def _within(self, loads: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Responses (n_free, k) mm of the reduced model to loads (n_free, k) mN at the place."""
+        projection = self.basis.projection
+        return projection.spanned(projection.reduced.system(self.at.moduli).backward(projection.components(loads)))
 
     def corrected(self, near: LinearSystem, missing: NDArray[np.float64], cost: SolveCounts) -> ReducedBasis:
         """The basis with what was missing (n_free, number) mm, found with the factorisation of a system."""
-        last = self.new + self.along.boundary.shape[1]
-        basis, at, sharper = self.basis, self.at, replace(self.basis, system=near.of(self.basis.full_model))
+        basis = self.basis
+        sharper = replace(basis, system=near.of(basis.full_model))
         if not self.number:
             return replace(sharper, counts=sharper.counts + cost)
-        if self.along.material.shape[1]:
-            before = basis.model.output_material
-            change = _changed(self.along.material, at.metric, missing[:, last:], every=self.every)
-            responses = (before + times(basis.constraint.free, change)).astype(before.dtype, copy=False)
-            sharper = sharper.with_material(responses, at.moduli if self.every else basis.material_at)
-        return _extended(replace(sharper, place=at), missing[:, :last], cost)
+        material_at = self.at.moduli if self.every else basis.material_at
+        found = _extended(replace(sharper, place=self.at, material_at=material_at), missing, cost)
+        return found.at_place() if self.new and len(material_at) else found
 
 
 def _corrected(found: Sequence[_Missing], near: LinearSystem) -> list[ReducedBasis]:
@@ -329,16 +323,13 @@ def _corrected(found: Sequence[_Missing], near: LinearSystem) -> list[ReducedBas
     loads = [of.loads(None if exact else product) for of in found]
     missing = solved(loads, [tolerance for of in found for tolerance in of.tolerances])
     del loads
-    if exact:
-        for of, own in zip(found, missing, strict=True):
-            own[:, of.new + of.along.boundary.shape[1] :] -= of.known
     further = [of.further_loads(own) for of, own in zip(found, missing, strict=True)]
     later = solved(further, [TANGENT] * sum(of.shape[1] for of in further))
     sharper = list[ReducedBasis]()
     for of, own, more in zip(found, missing, later, strict=True):
         if more.shape[1]:
             own[:, of.new :] += more
-        cost = SolveCounts(forward=of.new, tangent=of.along.number + more.shape[1])
+        cost = SolveCounts(forward=of.new, tangent=of.along.shape[1] + more.shape[1])
         sharper.append(of.corrected(near, own, cost))
     return sharper
 
@@ -380,23 +371,6 @@ def reduced_basis(model: LinearModel, moduli: NDArray[np.float64]) -> ReducedBas
 def basis_of(system: LinearSystem, snapshots: NDArray[np.float64], counts: SolveCounts) -> ReducedBasis:
     """A system's model on free displacements (n_free, k) mm, which are overwritten, with what these, and it, cost."""
     return ReducedBasis(projection(system.model, snapshots, overwrite=True), system, counts)
-
-
-def _changed(
-    along: NDArray[np.float64], metric: NDArray[np.float64] | None, missing: NDArray[np.float64], *, every: bool
-) -> NDArray[np.float64]:
-    """Change (n_free, n_material) mm of the responses U to the material modes that are exact along directions D.
-
-    missing (n_free, k): C - U D with the exact C. They become U + (C - U D) (D^T H D)^+ D^T H with the metric H (n, n)
-    of all, as those of an `Expansion`; with every mode along itself C.
-    """
-    if every:
-        return missing
-    if metric is None or not along.shape[1]:
-        return np.zeros((len(missing), len(along)))
-    own = metric[-len(along) :, -len(along) :]
-    with determined():
-        return np.asarray(missing @ (np.linalg.pinv(along.T @ own @ along, hermitian=True) @ (along.T @ own)))
 
 
 def _extended(basis: ReducedBasis, snapshots: NDArray[np.float64], cost: SolveCounts) -> ReducedBasis:

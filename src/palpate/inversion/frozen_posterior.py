@@ -257,7 +257,8 @@ def frozen_posterior(
             raise ConfigurationError(
                 f"the posterior is frozen on reduced models; state {s} has a {type(model).__name__}"
             )
-        answer = np.concatenate([*reduced.output_basis, reduced.output_modes, reduced.output_material], axis=1)
+        answer = np.concatenate([*reduced.output_basis, reduced.output_modes], axis=1)
+        answer = np.pad(answer, ((0, 0), (0, reduced.n_modes - reduced.n_boundary)))
         linearisations = [term for term in evaluation.linearisations if term.state == s]
         expanded = moduli if any(term.residuals.direct is not None for term in linearisations) else None
         if expanded is not None:

@@ -91,6 +91,11 @@ class Mixture:
         return np.asarray(self.weights @ np.stack([of.theta for of in self.explanations]))
 
     @property
+    def mean_unknowns(self) -> NDArray[np.float64]:
+        """(n_unknowns,) of all unknowns."""
+        return np.asarray(self.weights @ np.stack([of.minimum.unknowns for of in self.explanations]))
+
+    @property
     def covariance(self) -> NDArray[np.float64]:
         """(n_parameters, n_parameters) of theta: within explanations and between them."""
         away = np.stack([of.theta for of in self.explanations]) - self.mean

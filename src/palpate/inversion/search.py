@@ -27,8 +27,7 @@ RADIUS = 1.5  # of ln E: longest step
 FITS, FAR_FITS, STAYS = 10, 2, 0.01  # of the noise near the end, and far from it; change of its ln that ends them
 FAR_MOST = 6  # explanations that are compared far from the end
 NEAR = 1e-3  # decrement of a minimum on linear residuals
-HALVINGS = 5  # of a step that leads to a state which cannot be solved, or to a worse fit
-WORSE = 2.0  # rise of J at which a step is halved: closest points that slide over voxels make less
+HALVINGS = 5  # of a step that leads to a state which cannot be solved
 FLOOR = 1e-4  # of ln E: a move that is always short enough
 LAST_FIT = 0.3  # standard deviations that the mean moved: so near, the noise is fitted for the last time
 PATIENCE = 3  # iterations after which it is where a step was no longer than one: a search may go to and fro by more
@@ -56,7 +55,8 @@ ROUGH = StopRule(step_sd=0.3)  # of a search that goes on under another law
 class Searched:
     """Where a search is: the objective, all unknowns with their evaluation, and the posterior as it is known there.
 
-    The evaluation is that under the likeliest explanation. mixture: None before the first iteration. settled: whether
+    The unknowns are the mean of the posterior; where it ends, all but the moduli are at their best under the likeliest
+    explanation, under which the evaluation is. mixture: None before the first iteration. settled: whether
     the noise is fitted, after which the objective stays as it is; fits, stayed: number of all iterations, and of those
     since. moved: by how many of its standard deviations the mean moved last; led: theta (n_parameters,) of the last
     iterations near by, and the mean (n_parameters,) found from each.
@@ -188,10 +188,10 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     if (settled if rule.step_sd < LAST_FIT else exact) and (stays or circles):
         evaluation, outcome = evaluation.under(objective.parameters, at.unknowns), Outcome.CIRCLED
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED if stays else outcome)
-        return replace(before, minimum=minimum, settled=True)
+        return _as_likeliest(replace(before, minimum=minimum, settled=True), posterior)
     led = (*(now.led[-MEMORY:] if exact else ()), (theta, mixture.mean))
     goal = _fixed_point(led, sd) if share == 1.0 else theta + share * (mixture.mean - theta)
-    target = _target(posterior, objective, mixture, np.clip(goal, near.lower, near.upper))
+    target = np.concatenate([np.clip(goal, near.lower, near.upper), mixture.mean_unknowns[n:]])
     return _taken(replace(before, led=led), evaluation, target)
 
 
@@ -241,39 +241,32 @@ def _fitted(now: Searched, near: Bounds, *, fits: bool) -> tuple[Objective, Eval
     return objective, objective.weighed(at.unknowns, at.evaluation.linearisations, like)
 
 
-def _target(
-    posterior: Posterior, objective: Objective, mixture: Mixture, theta: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Unknowns (n_unknowns,) at theta (n_parameters,), all others at their best under the likeliest explanation."""
-    n = objective.n_parameters
-    start = np.concatenate([theta, mixture.minimum.unknowns[n:]])
-    own = posterior.believing(objective.parameters)
-    return gauss_newton(own, start, bounds=Bounds(theta, theta), tolerance=NEAR).unknowns
+def _as_likeliest(end: Searched, posterior: Posterior) -> Searched:
+    """The search where it ends, all unknowns but the moduli at their best under the likeliest explanation."""
+    at, objective = end.minimum, end.objective
+    theta = at.unknowns[: objective.n_parameters]
+    start = np.concatenate([theta, end.posterior.minimum.unknowns[len(theta) :]])
+    target = gauss_newton(posterior.believing(objective.parameters), start, bounds=Bounds(theta, theta), tolerance=NEAR)
+    there = _taken(end, at.evaluation, target.unknowns)
+    history = (*at.history[:-1], there.minimum.history[-1])
+    return replace(there, minimum=replace(there.minimum, outcome=at.outcome, history=history))
 
 
 def _taken(now: Searched, evaluation: Evaluation, target: NDArray[np.float64]) -> Searched:
-    """The search at a target (n_unknowns,), or nearer where its state cannot be solved or fits worse."""
-    at, objective, evaluations, failure = now.minimum, now.objective, now.minimum.evaluations, None
-    before = evaluation.under(objective.parameters, at.unknowns).value
+    """The search at a target (n_unknowns,), or nearer where its state cannot be solved."""
+    at, objective, failure = now.minimum, now.objective, SolverError("no step was tried")
+    believed = evaluation.under(objective.parameters, at.unknowns)
     for _ in range(HALVINGS):
         try:
-            there = _exact(
-                objective,
-                evaluation.under(objective.parameters, at.unknowns),
-                target,
-                near=now.settled or now.moved < 1.0,
-            )
+            there = _exact(objective, believed, target, near=now.settled or now.moved < 1.0)
         except (NotConverged, SolverError) as error:
             failure, target = error, at.unknowns + 0.5 * (target - at.unknowns)
             continue
-        failure, reached, evaluations = None, there(target), evaluations + 1
-        if reached.value < before + WORSE or not now.settled:
-            history = (*at.history, Iterate.of(target, reached, objective.n_parameters))
-            return replace(now, objective=there, minimum=Minimum(target, reached, Outcome.STEPS, history, evaluations))
-        target = at.unknowns + 0.5 * (target - at.unknowns)
-    if failure is not None:
-        raise failure
-    return replace(now, minimum=replace(at, outcome=Outcome.STUCK, evaluations=evaluations))
+        reached = there(target)
+        history = (*at.history, Iterate.of(target, reached, objective.n_parameters))
+        minimum = Minimum(target, reached, Outcome.STEPS, history, at.evaluations + 1)
+        return replace(now, objective=there, minimum=minimum)
+    raise failure
 
 
 def _exact(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64], *, near: bool) -> Objective:

@@ -159,7 +159,8 @@ def _free_responses(model: LinearModel, moduli: NDArray[np.float64]) -> NDArray[
 class _Responses:
     """A system with the responses (n_dof, n_boundary) and (n_dof, n_material) mm of its model to all modes.
 
-    alone (n_dof,) mm: to offset and loads; cost: of the former.
+    alone (n_dof,) mm: to offset and loads; cost: of the former; values (n_dof,) mm: the displacement of homogeneous
+    tissues that the material modes change.
     """
 
     system: LinearSystem
@@ -167,13 +168,14 @@ class _Responses:
     alone: NDArray[np.float32]
     cost: SolveCounts
     material: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32))
+    values: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def with_material(self, coefficients: NDArray[np.float64]) -> _Responses:
         """The same with responses to the material modes, at coefficients (n_modes,) of homogeneous tissues."""
         q = coefficients[: self.boundary.shape[1]].astype(np.float32)
         values = np.asarray(self.boundary @ q + self.alone, dtype=np.float64)
         material = self.system.material_responses(values, tolerance=SNAPSHOT, dtype=np.float32)
-        return replace(self, material=material)
+        return replace(self, material=material, values=values)
 
     def seen(self, state: LaterState, coefficients: NDArray[np.float64]) -> FirstOrderModel:
         """The observed part of the responses, to first order around coefficients (n_modes,), at fixed moduli."""
@@ -199,7 +201,8 @@ class _Responses:
             own = np.asarray(model.constraint.free.T @ self.alone, dtype=np.float64)
             projected = projected.extended(own[:, None])
         basis = ReducedBasis(projected, self.system.of(model), cost)
-        return basis.with_material(self.material @ material.astype(np.float32), self.system.moduli)
+        responses = self.material @ material.astype(np.float32)
+        return basis.with_material(responses, self.system.moduli, self.values)
 
 
 @dataclass(frozen=True, slots=True)

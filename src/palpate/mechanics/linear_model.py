@@ -198,6 +198,11 @@ class LinearModel:
         tissue, (lame, slopes) = self.space.mesh.region, self._lame(moduli, self.elements.dilatation)
         return material_forces(self.elements, self.material, values, lame, by_poisson=slopes, tissue=tissue)
 
+    def material_by_region(self, values: NDArray[np.float64]) -> tuple[MaterialForces, ...]:
+        """Those of each region alone, at 1 kPa."""
+        every, tissue = self.by_material(np.ones(self.n_regions), values), self.space.mesh.region
+        return tuple(every.of_cells(np.flatnonzero(tissue == region)) for region in self.regions)
+
     def _lame(self, moduli: NDArray[np.float64], dilatation: Dilatation) -> tuple[Moduli, Moduli]:
         """Lame's constants (n_tets,) of all elements at moduli (n_regions,) kPa; their slopes by Poisson's ratio."""
         tissue = self.space.mesh.region

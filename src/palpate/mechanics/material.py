@@ -118,9 +118,13 @@ class MaterialForces:
         return np.concatenate(mapped(some, np.array_split(directions, processors(), axis=1)), axis=1)
 
     def work(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
-        """G^T p (n_modes,), mN mm, of the forces along p (n_dof,) mm."""
+        """G^T p (n_modes,) or (n_modes, k), mN mm, of the forces along p (n_dof,) or (n_dof, k) mm."""
         parts = [np.asarray(amounts.T @ (scatter.T @ displacement)) for scatter, amounts in self.parts]
-        return np.concatenate([np.zeros(0), *parts])
+        return np.concatenate([np.zeros((0, *displacement.shape[1:])), *parts])
+
+    def of_cells(self, cells: NDArray[np.int64]) -> MaterialForces:
+        """Those of some elements (n,), by number."""
+        return replace(self, parts=tuple((scatter[:, cells], amounts[cells]) for scatter, amounts in self.parts))
 
 
 def material_forces(

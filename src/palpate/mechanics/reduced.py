@@ -1,15 +1,15 @@
 """Reduced models: Galerkin projection on a basis of displacements, whose online cost forgets the mesh.
 
-u = F V a + M q + o with V^T K_ff(E) V a = V^T F^T (f - K(E) (M q + o)); all blocks are affine in the moduli and kept
-densely, one for each region, the loads' once. Quarteroni, Manzoni & Negri, Reduced Basis Methods (2016), chapter 3.
+u = F V a + M q + o with V^T K_ff(E) V a = V^T F^T (f - K(E) (M q + o) - G(E) c); all blocks are affine in the moduli and
+kept densely, one for each region, the loads' once. G(E) c are the forces of a material that differs by c, at one
+displacement. Quarteroni, Manzoni & Negri, Reduced Basis Methods (2016), chapter 3.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from scipy import linalg, sparse
 from palpate.errors import ConfigurationError, SolverError
 from palpate.mechanics.forward import DenseEquilibrium, Outputs, checked_coefficients, checked_moduli
 from palpate.mechanics.linear_model import LinearModel, touched_rows
+from palpate.mechanics.material import MaterialForces
 from palpate.mechanics.solvers.cholesky import backward, forward, lower_factor
 from palpate.mechanics.solvers.conjugate_gradients import WORTH_THREADS, column_norms, times
 from palpate.parallel import mapped, processors
@@ -31,11 +32,10 @@ ROWS = 2048  # of basis vectors that are processed together, in the cache
 class ReducedModel:
     """A linear model on m basis vectors; implements `ForwardModel`.
 
-    Per region at 1 kPa: stiffness (n_regions, m, m) and coupling (n_regions, m, n_boundary + 1), mN/mm; load (m,) mN.
-    Outputs (rows): output_basis (n_outputs, m), in blocks of columns so that what is added to it copies nothing of what
-    is there; output_modes (n_outputs, n_boundary), output_offset (n_outputs,) and
-    output_material (n_outputs, n_material), mm: the responses du/dc_k to the material modes, held as they are, in
-    single precision where they are of all points and known no better.
+    Per region at 1 kPa: stiffness (n_regions, m, m) and coupling (n_regions, m, n_modes + 1), mN/mm, of boundary modes,
+    material modes and offset; load (m,) mN. Outputs (rows): output_basis (n_outputs, m), in blocks of columns so that
+    what is added to it copies nothing of what is there; output_modes (n_outputs, n_boundary), output_offset
+    (n_outputs,), mm.
     """
 
     names: tuple[str, ...]
@@ -45,7 +45,6 @@ class ReducedModel:
     output_basis: tuple[NDArray[np.float64], ...]
     output_modes: NDArray[np.float64]
     output_offset: NDArray[np.float64]
-    output_material: NDArray[np.floating[Any]]
 
     @property
     def n_regions(self) -> int:
@@ -55,12 +54,12 @@ class ReducedModel:
     @property
     def n_modes(self) -> int:
         """Number of boundary modes and material modes."""
-        return self.n_boundary + int(self.output_material.shape[1])
+        return int(self.coupling.shape[2]) - 1
 
     @property
     def n_boundary(self) -> int:
         """Number of boundary modes."""
-        return int(self.coupling.shape[2]) - 1
+        return int(self.output_modes.shape[1])
 
     @property
     def n_basis(self) -> int:
@@ -107,14 +106,13 @@ class ReducedModel:
             output_basis=(np.concatenate([seen(block) for block in self.output_basis], axis=1),),
             output_modes=seen(self.output_modes),
             output_offset=seen(self.output_offset),
-            output_material=seen(self.output_material.astype(np.float64, copy=False)),
         )
 
     def system(self, moduli: NDArray[np.float64], like: ReducedSystem | None = None, common: int = 0) -> ReducedSystem:
         """The factorised reduced system at moduli (n_regions,) kPa; raises `SolverError`.
 
         like: one at the same moduli, whose model has as many first basis vectors `common` (see `common_vectors`): their
-        part is not factorised again.
+        part is not factorised again, and their responses to boundary modes are known.
         """
         checked = checked_moduli(moduli, self.names)
         try:
@@ -132,17 +130,17 @@ class ReducedModel:
     def _bordered(
         self, moduli: NDArray[np.float64], like: ReducedSystem, n: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Factor L (m, m) and L^-1 (C E - f) (m, n_boundary + 1), n of whose rows are known but for the last column."""
-        rows = _weighted(moduli, self.stiffness[:, n:])
-        forces, last = _weighted(moduli, self.coupling[:, n:]), moduli @ self.coupling[:, :n, -1] - self.load[:n]
-        forces[:, -1] -= self.load[n:]
+        """Factor L (m, m) and L^-1 (C E - f) (m, n_modes + 1), n of whose rows are known for boundary modes."""
+        rows, known = _weighted(moduli, self.stiffness[:, n:]), self.n_boundary
+        forces = _weighted(moduli, self.coupling)
+        forces[:, -1] -= self.load
         first = np.asfortranarray(like.factor[:n, :n])
         below = forward(first, rows[:, :n].T).T
         factor, halves = np.zeros((self.n_basis,) * 2, order="F"), np.empty((self.n_basis, forces.shape[1]), order="F")
         factor[:n, :n], factor[n:, :n] = first, below
         factor[n:, n:] = corner = lower_factor(rows[:, n:] - below @ below.T)
-        halves[:n, :-1], halves[:n, -1] = like.halves[:n, :-1], forward(first, last)
-        halves[n:] = forward(corner, forces - below @ halves[:n])
+        halves[:n, :known], halves[:n, known:] = like.halves[:n, :known], forward(first, forces[:n, known:])
+        halves[n:] = forward(corner, forces[n:] - below @ halves[:n])
         return factor, halves
 
     def solve(self, moduli: NDArray[np.float64], coefficients: NDArray[np.float64]) -> ReducedEquilibrium:
@@ -150,7 +148,7 @@ class ReducedModel:
         return self.system(moduli).solve(coefficients)
 
     def amplitude(self, moduli: NDArray[np.float64], given: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Basis coefficients (m,) alone, at moduli (n_regions,) kPa and [q, 1] (n_boundary + 1,); raises `SolverError`.
+        """Basis coefficients (m,) alone, at moduli (n_regions,) kPa and [q, 1] (n_modes + 1,); raises `SolverError`.
 
         Nothing is checked: it is the fast way of those who ask ten thousands of times.
         """
@@ -174,12 +172,12 @@ class ReducedModel:
 
 
 def common_vectors(model: ReducedModel, other: ReducedModel) -> int:
-    """How many first basis vectors two models share, with all that is known of them but for offset and loads."""
+    """How many first basis vectors two models share, with all that boundary modes do to them."""
     n = min(model.n_basis, other.n_basis)
-    if model.coupling.shape[::2] != other.coupling.shape[::2]:
+    if (model.n_regions, model.n_boundary) != (other.n_regions, other.n_boundary):
         return 0
-    unlike = np.any(model.stiffness[:, :n, :n] != other.stiffness[:, :n, :n], axis=0)
-    unlike |= np.diag(np.any(model.coupling[:, :n, :-1] != other.coupling[:, :n, :-1], axis=(0, 2)))
+    unlike, boundary = np.any(model.stiffness[:, :n, :n] != other.stiffness[:, :n, :n], axis=0), model.n_boundary
+    unlike |= np.diag(np.any(model.coupling[:, :n, :boundary] != other.coupling[:, :n, :boundary], axis=(0, 2)))
     return int(np.maximum(*np.nonzero(unlike)).min(initial=n))
 
 
@@ -192,8 +190,8 @@ def _weighted(weights: NDArray[np.float64], matrices: NDArray[np.float64]) -> ND
 class ReducedSystem:
     """A reduced model at fixed moduli (n_regions,) kPa.
 
-    factor L (m, m): lower Cholesky factor; amplitudes -L^-T h (m, n_boundary + 1): basis coefficients of every unit
-    response, of halves h (m, n_boundary + 1).
+    factor L (m, m): lower Cholesky factor; amplitudes -L^-T h (m, n_modes + 1): basis coefficients of every unit
+    response, of halves h (m, n_modes + 1).
     """
 
     model: ReducedModel
@@ -205,15 +203,16 @@ class ReducedSystem:
     def responses(self) -> NDArray[np.float64]:
         """Outputs (n_outputs, n_modes + 1) mm for each unit mode without the offset and, last, for the offset."""
         model = self.model
-        given = np.column_stack([model.output_modes, model.output_offset])
-        return np.asarray(given + model.spanned(self.amplitudes))
+        found = model.spanned(self.amplitudes)
+        found[:, : model.n_boundary] += model.output_modes
+        found[:, -1] += model.output_offset
+        return found
 
     def solve(self, coefficients: NDArray[np.float64]) -> ReducedEquilibrium:
         """Equilibrium at mode coefficients (n_modes,), dimensionless: no further solve."""
         checked, model = checked_coefficients(coefficients, self.model.n_modes), self.model
-        boundary, material = np.split(checked, [model.n_boundary])
-        amplitude = self.amplitudes @ np.append(boundary, 1.0)
-        given = model.output_modes @ boundary + model.output_offset + model.output_material @ material
+        amplitude = self.amplitudes @ np.append(checked, 1.0)
+        given = model.output_modes @ checked[: model.n_boundary] + model.output_offset
         values = given + model.spanned(amplitude)
         values.setflags(write=False)
         return ReducedEquilibrium(self, checked, amplitude, values)
@@ -233,7 +232,7 @@ class ReducedEquilibrium(DenseEquilibrium):
     values: NDArray[np.float64]
 
     def amplitude_tangent(self, slopes: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """Derivatives (m, k + n_boundary) of the basis coefficients by what moves the moduli, then by boundary modes.
+        """Derivatives (m, k + n_modes) of the basis coefficients by what moves the moduli, then by all modes.
 
         slopes (n_regions, k): of ln E by the former; None: ln E itself.
         """
@@ -245,8 +244,8 @@ class ReducedEquilibrium(DenseEquilibrium):
         """T (n_outputs, n_regions + n_modes), mm: columns du / d ln E_r, then du / dq_k."""
         model = self.system.model
         tangent = model.spanned(self.amplitude_tangent())
-        tangent[:, model.n_regions :] += model.output_modes
-        return np.concatenate([tangent, model.output_material], axis=1)
+        tangent[:, model.n_regions : model.n_regions + model.n_boundary] += model.output_modes
+        return tangent
 
     def adjoint(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
         """T^T g (n_regions + n_modes,) for g (n_outputs,), by one dense adjoint solve."""
@@ -254,13 +253,14 @@ class ReducedEquilibrium(DenseEquilibrium):
         reduced = model.components(gradient)
         adjoint = self.system.backward(reduced[:, None])[:, 0]
         by_modulus = -self._modulus_forces().T @ adjoint
-        by_mode = self.system.amplitudes[:, :-1].T @ reduced + model.output_modes.T @ gradient
-        return np.concatenate([by_modulus, by_mode, model.output_material.T @ gradient])
+        by_mode = self.system.amplitudes[:, :-1].T @ reduced
+        by_mode[: model.n_boundary] += model.output_modes.T @ gradient
+        return np.concatenate([by_modulus, by_mode])
 
     def _modulus_forces(self) -> NDArray[np.float64]:
         """E_r (A_r a + B_r [q, 1]), (m, n_regions) mN."""
         model = self.system.model
-        given = np.append(self.coefficients[: model.n_boundary], 1.0)
+        given = np.append(self.coefficients, 1.0)
         # as one matrix each, for products of several matrices are slow
         forces = model.stiffness.reshape(-1, model.n_basis) @ self.amplitude
         forces += model.coupling.reshape(-1, len(given)) @ given
@@ -269,10 +269,15 @@ class ReducedEquilibrium(DenseEquilibrium):
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """A linear model on the span of orthonormal vectors V (n_free, m): the reduced model, and what extends it."""
+    """A linear model on the span of orthonormal vectors V (n_free, m): the reduced model, and what extends it.
+
+    by_material: of each region, the derivatives of the nodal forces at 1 kPa by the material's coefficients, at the
+    displacement that the responses to them are of; none while that is not known: these then move nothing.
+    """
 
     model: LinearModel
     reduced: ReducedModel
+    by_material: tuple[MaterialForces, ...] = ()
 
     def spanned(self, amplitudes: NDArray[np.float64]) -> NDArray[np.float64]:
         """V a (n_free, k) for amplitudes a (m, k)."""
@@ -309,26 +314,32 @@ class Projection:
         reduced = replace(
             old,
             stiffness=np.stack(blocks),
-            coupling=np.concatenate([old.coupling, _coupling(model, fresh)], axis=1),
+            coupling=np.concatenate([old.coupling, _coupling(model, self.by_material, fresh)], axis=1),
             load=np.concatenate([old.load, fresh.T @ model.free_load]),
             output_basis=(*old.output_basis, times(model.constraint.free, fresh)),
         )
-        return Projection(model, reduced)
+        return replace(self, reduced=reduced)
 
     def under(self, model: LinearModel) -> Projection:
-        """The projection of another state of the body, whose modes are the same, on the same vectors in memory."""
-        if model.coupling is self.model.coupling and not np.any(model.free_load - self.model.free_load):
-            return replace(self, model=model)
+        """The projection of another state of the body, whose modes are the same, on the same vectors in memory.
+
+        Not at the displacement of this state: material modes move nothing.
+        """
         coupling = self.reduced.coupling.copy()
+        coupling[:, :, self.reduced.n_boundary : -1] = 0.0
         for number, matrix in enumerate(model.coupling):
             coupling[number, :, -1] = self.components(matrix[:, -1:].toarray())[:, 0]
         load = self.components(model.free_load[:, None])[:, 0]
         reduced = replace(self.reduced, coupling=coupling, load=load, output_offset=model.constraint.offset)
         return Projection(model, reduced)
 
-    def with_material(self, responses: NDArray[np.floating[Any]]) -> Projection:
-        """The projection with responses du/dc_k (n_dof, n_material) mm to the material modes."""
-        return replace(self, reduced=replace(self.reduced, output_material=responses))
+    def at_displacement(self, values: NDArray[np.float64]) -> Projection:
+        """The projection with the forces of the material modes at a displacement (n_dof,) mm of homogeneous tissues."""
+        by_material, vectors = self.model.material_by_region(values), self.reduced.output_basis
+        coupling, first = self.reduced.coupling.copy(), self.reduced.n_boundary
+        for of_region, forces in zip(coupling, by_material, strict=True):
+            of_region[:, first:-1] = np.concatenate([forces.work(block).T for block in vectors])
+        return replace(self, reduced=replace(self.reduced, coupling=coupling), by_material=by_material)
 
 
 def free_combinations(
@@ -354,12 +365,9 @@ def projection(model: LinearModel, snapshots: NDArray[np.float64], *, overwrite:
     """
     vectors = orthonormal_basis(_checked(model, snapshots), overwrite=overwrite)
     stiffness = np.stack([_projected(matrix, vectors) for matrix in model.free_stiffness])
-    load, coupling = np.asarray(vectors.T @ model.free_load), _coupling(model, vectors)
+    load, coupling = np.asarray(vectors.T @ model.free_load), _coupling(model, (), vectors)
     outputs, constraint = times(model.constraint.free, vectors), model.constraint
-    none = np.zeros((len(outputs), model.material.n_modes))
-    reduced = ReducedModel(
-        model.names, stiffness, coupling, load, (outputs,), constraint.modes, constraint.offset, none
-    )
+    reduced = ReducedModel(model.names, stiffness, coupling, load, (outputs,), constraint.modes, constraint.offset)
     return Projection(model, reduced)
 
 
@@ -424,6 +432,16 @@ def _checked(model: LinearModel, snapshots: NDArray[np.float64]) -> NDArray[np.f
     return snapshots
 
 
-def _coupling(model: LinearModel, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """V^T C_r (n_regions, m, n_modes + 1)."""
-    return np.stack([np.asarray((matrix.T @ vectors).T) for matrix in model.coupling])
+def _coupling(
+    model: LinearModel, by_material: Sequence[MaterialForces], vectors: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """V^T [C_r, G_r, o_r] (n_regions, m, n_modes + 1), 0 of material modes whose forces are not known."""
+    found = np.zeros((model.n_regions, vectors.shape[1], model.n_modes + 1))
+    first = model.constraint.n_modes
+    for of_region, matrix in zip(found, model.coupling, strict=True):
+        given = np.asarray((matrix.T @ vectors).T)
+        of_region[:, :first], of_region[:, -1] = given[:, :-1], given[:, -1]
+    outputs = times(model.constraint.free, vectors) if by_material else vectors
+    for of_region, forces in zip(found, by_material, strict=False):
+        of_region[:, first:-1] = forces.work(outputs).T
+    return found

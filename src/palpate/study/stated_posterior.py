@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate.approximation.contract import Approximation, LinearisationPoint, updated
 from palpate.errors import SolverError
-from palpate.inversion import Bounds, Inversion, Minimum, Objective, Posterior, cheapest_posterior
+from palpate.inversion import Bounds, Inversion, Minimum, Objective, Posterior, cheapest_posterior, gauss_newton
 from palpate.parallel import mapped
 from palpate.uncertainty import (
     NORMAL_95,
@@ -23,6 +23,7 @@ from palpate.uncertainty import (
 
 ROUNDS = 3  # largest number of times that models are made exact where profiles end
 MISSED = 1e-2  # of the displacement, in energy: error up to which a model is exact; it moves ends by a few hundredths
+TOLERANCE = 1e-3  # decrement of the minimum under the likeliest explanation
 STAYS = 0.1  # of the half-width: largest change of an end with which the rounds stop
 
 
@@ -49,7 +50,8 @@ def as_stated(inversion: Inversion, own: Covariance, bounds: Bounds) -> StatedPo
     objective, minimum = inversion.objective, inversion.minimum
     mixture = stated_mixture(inversion.mixture, own, objective.parameters.blocks)
     frozen = cheapest_posterior(objective, minimum.unknowns, minimum.evaluation)
-    posterior = StatedPosterior(frozen, inversion.mixture.minimum, mixture)
+    least = gauss_newton(frozen, inversion.mixture.minimum.unknowns, bounds=bounds, tolerance=TOLERANCE)
+    posterior = StatedPosterior(frozen, least, mixture)
     return exact_at_ends(profiled(posterior, bounds), objective, bounds) if minimum.converged else posterior
 
 
