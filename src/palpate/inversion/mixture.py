@@ -7,20 +7,20 @@ evidence, by Laplace's approximation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, special
 
 from palpate.approximation.contract import determined
 from palpate.errors import EstimationError, SolverError
 from palpate.inversion.frozen_posterior import Posterior
 from palpate.inversion.objective import Evaluation
 from palpate.inversion.optimise import Bounds, Minimum, gauss_newton, posterior_sd, same_minimum
-from palpate.inversion.scenarios import Alternatives, alternatives_of, scenarios_of
+from palpate.inversion.scenarios import Alternatives, alternatives_of, frames_of, scenarios_of
 from palpate.mechanics.solvers.cholesky import backward, forward, lower_factor
 from palpate.parallel import mapped
 from palpate.unknowns.arrowhead import Arrowhead
@@ -29,8 +29,7 @@ from palpate.unknowns.parameters import ParameterMap, Volume
 
 TRUSTED_SD = 0.5  # of ln E: how far residuals are taken for linear where explanations are compared first
 SEEN = 6.0  # of the log-evidence: explanations that are less likely than the best one by so much are left out
-MOST = 40  # explanations whose minimum is sought on the model, of all later images together
-FEWEST = 10  # the same, however many later images there are
+MOST = 12  # explanations of a group whose minimum is sought on the model
 ROUNDS = 4  # over all images, to find the likeliest alternatives of each
 MINIMUM = 1e-3  # decrement at which the minimum of an explanation ends: 0.045 sd from it, as a search does
 VOLUMES, VOLUME_SD, AT_ONCE = 3, 0.1, 0.8  # searches with the room of all others, its accuracy in sd, ln E a search
@@ -44,8 +43,8 @@ class Explanation:
 
     chosen: numbers of the alternatives, by block; scenario, images: in words; theta (n_parameters,) and covariance
     (n_parameters, n_parameters): of the log-moduli, normal; minimum: that of all unknowns with the `volume`, the room
-    that theta leaves all others there; level: log of the probability but for a constant; number: of the minimum, where
-    it has several.
+    that theta leaves all others there; level: log of the probability but for a constant; group: of its scenario;
+    number: of the minimum, where it has several.
     """
 
     chosen: Mapping[int, int]
@@ -57,6 +56,7 @@ class Explanation:
     minimum: Minimum = field(repr=False)
     volume: Volume | None = None
     level: float = 0.0
+    group: tuple[str, ...] = ()
     number: int = 0
 
     @property
@@ -74,6 +74,19 @@ class Mixture:
     """The posterior of theta: explanations with their weights, the likeliest first, which add up to 1."""
 
     explanations: tuple[Explanation, ...]
+
+    @classmethod
+    def of(cls, explanations: Iterable[Explanation]) -> Mixture:
+        """That of explanations with the weights that their levels tell."""
+        found = sorted(explanations, key=lambda of: -of.level)
+        weights = np.exp([of.level - found[0].level for of in found])
+        shares = (weights / weights.sum()).tolist()
+        return cls(tuple(replace(of, weight=w) for of, w in zip(found, shares, strict=True) if w > 0.0))
+
+    @property
+    def level(self) -> float:
+        """Log of the sum of the explanations' probabilities, but for the constant of their levels."""
+        return float(special.logsumexp([of.level for of in self.explanations]))
 
     @property
     def minimum(self) -> Minimum:
@@ -121,24 +134,25 @@ def mixture_of(
     unknowns: NDArray[np.float64],
     evaluation: Evaluation,
     bounds: Bounds,
+    kept: Callable[[Alternatives], bool],
     *,
     begins: Sequence[NDArray[np.float64]] = (),
     most: int = MOST,
+    of_group: int | None = None,
     earlier: Mixture | None = None,
-    narrowest: bool = False,
 ) -> Mixture:
-    """The posterior of theta over all explanations.
+    """The posterior of theta over all explanations of the scenarios that are `kept`.
 
     First every explanation is compared with the residuals linear around unknowns (n_unknowns,), within `TRUSTED_SD`
-    there (see `LinearEvidence`). Then the minimum of the likeliest, `most` at most, is found on the `posterior`,
-    however far, that of theta with all else integrated out, with the evidence there. begins (n_unknowns,) each: where
-    further minima of the likeliest explanation are sought; earlier: what is known of explanations near by, where their
-    minima are sought; narrowest: whether homogeneous tissues alone are compared. Raises `EstimationError` where images
-    and prior leave an unknown open, or no minimum can be solved for.
+    there (see `LinearEvidence`). Then the minimum of the likeliest, `most` at most and `of_group` of one group, is
+    found on the `posterior`, however far, that of theta with all else integrated out, with the evidence there. begins
+    (n_unknowns,) each: where further minima of the likeliest explanation are sought; earlier: what is known of
+    explanations near by, where their minima are sought. Raises `EstimationError` where images and prior leave an
+    unknown open, or no minimum can be solved for.
     """
     n = posterior.n_parameters
     with determined():
-        compared = LinearEvidence.of(posterior.parameters, evaluation, unknowns).compared(most, narrowest=narrowest)
+        compared = LinearEvidence.of(posterior.parameters, evaluation, unknowns).compared(kept, most, of_group)
     known = {of.key: (of.minimum.unknowns, of.volume) for of in (earlier.explanations if earlier else ())}
     jobs = [(of, *known.get((0, tuple(sorted(of.chosen))), (of.unknowns, None))) for of in compared]
     found = [each for each in mapped(lambda job: _laplace(posterior, bounds, *job), jobs) if each is not None]
@@ -149,24 +163,24 @@ def mixture_of(
         others = [other.minimum for other in found if other.of is likeliest.of]
         if each is not None and not any(same_minimum(each.minimum.unknowns, other, n) for other in others):
             found.append(each)
-    weights = np.exp([each.level - likeliest.level for each in found])
-    explanations = [
+    squares = posterior(unknowns)
+    robust = (evaluation.value - evaluation.prior_value) - (squares.value - squares.prior_value)  # of outliers
+    return Mixture.of(
         Explanation(
             dict(each.of.chosen),
-            each.of.scenario,
+            each.of.scenario.words,
             each.of.images,
-            float(weights[i] / weights.sum()),
+            1.0,
             each.minimum.unknowns[:n],
             each.minimum.evaluation.covariance_columns(n)[:n],
             each.minimum,
             each.volume,
-            each.level,
+            each.level - robust,
+            each.of.scenario.group,
             sum(other.of is each.of for other in found[:i]),
         )
         for i, each in enumerate(found)
-        if weights[i] > 0.0
-    ]
-    return Mixture(tuple(sorted(explanations, key=lambda of: -of.level)))
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +192,7 @@ class _Compared:
     """
 
     chosen: tuple[tuple[int, int], ...]
-    scenario: tuple[str, ...]
+    scenario: Alternatives
     images: tuple[tuple[str, ...], ...]
     unknowns: NDArray[np.float64]
     evidence: float
@@ -293,6 +307,15 @@ class _Eliminated:
 
 
 @dataclass(frozen=True, slots=True)
+class _OfImage:
+    """An alternative of a later image: how its `frame` moves, by block, how it is `drawn`, and what is eliminated."""
+
+    frame: Mapping[int, int]
+    drawn: Alternatives
+    eliminated: _Eliminated
+
+
+@dataclass(frozen=True, slots=True)
 class _Step:
     """A block of m unknowns eliminated before n others that follow, and a right-hand side.
 
@@ -343,7 +366,7 @@ class LinearEvidence:
     shared: NDArray[np.int64]
     information: NDArray[np.float64]
     pull: NDArray[np.float64]
-    images: tuple[tuple[tuple[Alternatives, _Eliminated], ...], ...]
+    images: tuple[tuple[_OfImage, ...], ...]
 
     @classmethod
     def of(cls, parameters: ParameterMap, evaluation: Evaluation, unknowns: NDArray[np.float64]) -> LinearEvidence:
@@ -364,20 +387,21 @@ class LinearEvidence:
         pull: NDArray[np.float64],
         state: int,
         shared: NDArray[np.int64],
-    ) -> Iterator[tuple[Alternatives, _Eliminated]]:
-        """Each alternative of a later state with what its own unknowns take.
+    ) -> Iterator[_OfImage]:
+        """Each alternative of a later state, under each motion of its frame, with what its own unknowns take.
 
         Block after block is eliminated, those that may be otherwise last: alternatives that begin alike share it.
         """
-        every = alternatives_of(parameters.blocks, state)
-        open_ = list(dict.fromkeys(i for alternatives in every for i, _ in alternatives.chosen))
+        frames, drawings = frames_of(parameters.blocks, state), alternatives_of(parameters.blocks, state)
+        every = [(dict(frame), alternatives) for frame in frames for alternatives in drawings]
+        open_ = list(dict.fromkeys(i for frame, alternatives in every for i in (*frame, *dict(alternatives.chosen))))
         blocks = [*(i for i in parameters.blocks_of_image(state) if i not in open_), *open_]
         own = np.concatenate([np.zeros(0, dtype=np.int64), *(parameters.columns(i) for i in blocks)])
         border = np.column_stack([data.block(own, shared), pull[own]])
         corner = np.zeros((border.shape[1],) * 2)
         whole, known = np.block([[data.block(own, own), border], [border.T, corner]]), dict[tuple[int, ...], _Step]()
-        for alternatives in every:
-            chosen, steps, path = dict(alternatives.chosen), list[_Step](), tuple[int, ...]()
+        for frame, alternatives in every:
+            chosen, steps, path = frame | dict(alternatives.chosen), list[_Step](), tuple[int, ...]()
             for i in blocks:
                 path = (*path, chosen.get(i, -1))
                 if path not in known:
@@ -386,58 +410,61 @@ class LinearEvidence:
                 steps.append(known[path])
             left = steps[-1].left if steps else corner
             level = 0.5 * (sum(step.determinant for step in steps) - float(left[-1, -1])) + alternatives.log_odds
-            yield alternatives, _Eliminated(own, tuple(steps), -left[:-1, :-1], -left[:-1, -1], level)
+            eliminated = _Eliminated(own, tuple(steps), -left[:-1, :-1], -left[:-1, -1], level)
+            yield _OfImage(frame, alternatives, eliminated)
 
-    def compared(self, most: int, *, narrowest: bool = False) -> list[_Compared]:
-        """The likeliest explanations, `most` at most: of each scenario the likeliest, and others of its images.
+    def compared(self, kept: Callable[[Alternatives], bool], most: int, of_group: int | None = None) -> list[_Compared]:
+        """The likeliest explanations, `most` at most, of the scenarios that are `kept`, `of_group` of one group.
 
         Of several images the alternatives of each are chosen in turn, beside those of the others. Which combinations
         are likely is then told by what each of an image's alternatives loses alone.
         """
-        found, fewest = (
-            list[tuple[float, Callable[[], _Compared]]](),
-            max(most // max(len(self.images), 1), min(FEWEST, most)),
-        )
-        for scenario in scenarios_of(self.parameters.blocks)[: 1 if narrowest else None]:
-            found += self._of_scenario(scenario, most)
-        best = max(evidence for evidence, _ in found)
-        found = sorted((each for each in found if each[0] > best - SEEN), key=lambda each: -each[0])
-        return [minimum() for _, minimum in found[:fewest]]
+        found, counts = list[tuple[float, Alternatives, Callable[[], _Compared]]](), dict[tuple[str, ...], int]()
+        for scenario in scenarios_of(self.parameters.blocks):
+            if kept(scenario):
+                found += [(evidence, scenario, minimum) for evidence, minimum in self._of_scenario(scenario, most)]
+        best, chosen = max(evidence for evidence, *_ in found), list[_Compared]()
+        for evidence, scenario, minimum in sorted(found, key=lambda each: -each[0]):
+            number = counts[scenario.group] = counts.get(scenario.group, 0) + 1
+            if evidence > best - SEEN and len(chosen) < most and (of_group is None or number <= of_group):
+                chosen.append(minimum())
+        return chosen
 
     def _of_scenario(self, scenario: Alternatives, most: int) -> list[tuple[float, Callable[[], _Compared]]]:
         """Its likeliest explanation, and those seen beside it, `most` at most: evidence, and what finds the minimum."""
         parameters, shared = self.parameters.choosing(dict(scenario.chosen)), self.shared
         prior, centre = parameters.prior_matrix.block(shared, shared), parameters.prior_centre[shared]
-        n = parameters.n_parameters
+        n, chosen = parameters.n_parameters, dict(scenario.chosen)
+        images = [[of for of in image if of.frame.items() <= chosen.items()] for image in self.images]
         own = 0.5 * (log_det(Arrowhead.of(prior[n:, n:])) - float(centre @ prior @ centre)) + scenario.log_odds
         information, pull = self.information + prior, self.pull + prior @ centre
 
         def evidence(numbers: Sequence[int], k: int | None = None) -> list[float]:
             """The log-evidence of alternatives by their number in each image, of all those of image k in its place."""
-            parts = [image[i][1] for j, (image, i) in enumerate(zip(self.images, numbers, strict=True)) if j != k]
+            parts = [image[i].eliminated for j, (image, i) in enumerate(zip(images, numbers, strict=True)) if j != k]
             matrix, right = information - sum(part.taken for part in parts), pull - sum(part.pull for part in parts)
             level = own + sum(part.level for part in parts)
             if k is None:
                 return [level + _log_evidence(matrix, right)]
-            each = [part for _, part in self.images[k]]
+            each = [of.eliminated for of in images[k]]
             return [level + part.level + _log_evidence(matrix - part.taken, right - part.pull) for part in each]
 
         def others(numbers: tuple[int, ...], k: int) -> dict[tuple[int, ...], float]:
             """All explanations that differ from one in image k alone, and itself."""
-            every = [(*numbers[:k], i, *numbers[k + 1 :]) for i in range(len(self.images[k]))]
+            every = [(*numbers[:k], i, *numbers[k + 1 :]) for i in range(len(images[k]))]
             return dict(zip(every, evidence(numbers, k), strict=True))
 
-        numbers = tuple(max(range(len(image)), key=lambda i: image[i][1].level) for image in self.images)
-        by_image = [dict[tuple[int, ...], float]() for _ in self.images]
-        for _ in range(ROUNDS if len(self.images) > 1 else 1):
+        numbers = tuple(max(range(len(image)), key=lambda i: image[i].eliminated.level) for image in images)
+        by_image = [dict[tuple[int, ...], float]() for _ in images]
+        for _ in range(ROUNDS if len(images) > 1 else 1):
             before = numbers
-            for k in range(len(self.images)):
+            for k in range(len(images)):
                 by_image[k] = others(numbers, k)
                 numbers = max(by_image[k], key=lambda each: by_image[k][each])
             if numbers == before:
                 break
         else:  # the first images' are of other alternatives of the last ones
-            by_image = [others(numbers, k) for k in range(len(self.images))] if len(self.images) > 1 else by_image
+            by_image = [others(numbers, k) for k in range(len(images))] if len(images) > 1 else by_image
         best = max(level for of in by_image for level in of.values()) if by_image else evidence(())[0]
         gains = [{each[k]: level - best for each, level in of.items()} for k, of in enumerate(by_image)]
         together = _likeliest_together(gains, most)
@@ -447,28 +474,27 @@ class LinearEvidence:
         best = max(levels.values())
         seen = [(each, level) for each, level in levels.items() if level > best - SEEN]
         return [
-            (level + several, partial(self._compared, scenario, each, level + several, several, prior, pull))
-            for each, level in seen
+            (level + several, partial(self._compared, scenario, parts, level + several, several, prior, pull))
+            for parts, level in (([of[i] for of, i in zip(images, each, strict=True)], level) for each, level in seen)
         ]
 
     def _compared(
         self,
         scenario: Alternatives,
-        numbers: Sequence[int],
+        parts: Sequence[_OfImage],
         evidence: float,
         several: float,
         prior: NDArray[np.float64],
         pull: NDArray[np.float64],
     ) -> _Compared:
         """One explanation with its minimum (n_unknowns,)."""
-        parts = [image[k] for image, k in zip(self.images, numbers, strict=True)]
-        matrix = self.information + prior - sum(part.taken for _, part in parts)
-        of_shared = linalg.solve(matrix, pull - sum(part.pull for _, part in parts), assume_a="pos")
+        matrix = self.information + prior - sum(part.eliminated.taken for part in parts)
+        of_shared = linalg.solve(matrix, pull - sum(part.eliminated.pull for part in parts), assume_a="pos")
         unknowns = np.empty(self.parameters.n_unknowns)
         unknowns[self.shared] = of_shared
-        for _, part in parts:
-            unknowns[part.own] = part.following(of_shared)
-        chosen = scenario.chosen + tuple(pair for of, _ in parts for pair in of.chosen)
-        odds = scenario.log_odds + sum(of.log_odds for of, _ in parts)
-        words = tuple(of.words for of, _ in parts)
-        return _Compared(chosen, scenario.words, words, unknowns, evidence, odds, several)
+        for part in parts:
+            unknowns[part.eliminated.own] = part.eliminated.following(of_shared)
+        chosen = scenario.chosen + tuple(pair for part in parts for pair in part.drawn.chosen)
+        odds = scenario.log_odds + sum(part.drawn.log_odds for part in parts)
+        words = tuple(part.drawn.words for part in parts)
+        return _Compared(chosen, scenario, words, unknowns, evidence, odds, several)

@@ -41,10 +41,6 @@ class Outcome(StrEnum):
     """How an iteration ended; the value is the sentence that the user reads."""
 
     CONVERGED = "the search ended by its tolerance"
-    CIRCLED = (
-        "the evidence of explanations changes with the moduli: the search went round in circles, and ended in their"
-        " middle, within half a standard deviation"
-    )
     STEPS = "the iteration reached its largest number of steps"
     STUCK = "no step reduced the objective; check the images and the fit of the driver's surface"
     UNSOLVABLE = "every shorter step led to a state that cannot be solved, for example with elements inside out"
@@ -53,7 +49,7 @@ class Outcome(StrEnum):
     @property
     def converged(self) -> bool:
         """Whether the point reached is a minimum."""
-        return self in (Outcome.CONVERGED, Outcome.CIRCLED)
+        return self is Outcome.CONVERGED
 
 
 @dataclass(frozen=True, slots=True)

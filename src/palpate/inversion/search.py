@@ -19,21 +19,24 @@ from palpate.inversion.hyper_parameters import with_amplitudes, with_correlation
 from palpate.inversion.mixture import MOST, Mixture, mixture_of
 from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, gauss_newton
+from palpate.inversion.scenarios import Alternatives, scenarios_of
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.forward import SolveCounts
 from palpate.progress import Progress
 
 RADIUS = 1.5  # of ln E: longest step
 FITS, FAR_FITS, STAYS = 10, 2, 0.01  # of the noise near the end, and far from it; change of its ln that ends them
-FAR_MOST = 6  # explanations that are compared far from the end
 NEAR = 1e-3  # decrement of a minimum on linear residuals
 HALVINGS = 5  # of a step that leads to a state which cannot be solved
 FLOOR = 1e-4  # of ln E: a move that is always short enough
 LAST_FIT = 0.3  # standard deviations that the mean moved: so near, the noise is fitted for the last time
 PATIENCE = 3  # iterations after which it is where a step was no longer than one: a search may go to and fro by more
-CIRCLE = 0.5  # standard deviations that the mean may move by where a search that went round in circles ends
-MEMORY, DEPENDENT = 2, 1e-2  # earlier iterations that count; relative size of ways that count as dependent
 CALM = 0.8  # of ln of what residuals weigh: a change with which the noise still follows the search
+FREE = 2  # first iterations, of homogeneous tissues, in which the frame may move or not
+FAR_MOST, OF_RIVALS = 6, 2  # explanations that are compared on the way; those of each other group
+RIVAL = 3.0  # of the log-evidence: groups less likely by so much, as the likeliest one sees them, are left out
+FOLLOWED = 4  # iterations in which a rival is followed
+CHANGES = 2  # of the likeliest group, after which the search ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,20 +59,20 @@ class Searched:
     """Where a search is: the objective, all unknowns with their evaluation, and the posterior as it is known there.
 
     The unknowns are the mean of the posterior; where it ends, all but the moduli are at their best under the likeliest
-    explanation, under which the evaluation is. mixture: None before the first iteration. settled: whether
-    the noise is fitted, after which the objective stays as it is; fits, stayed: number of all iterations, and of those
-    since. moved: by how many of its standard deviations the mean moved last; led: theta (n_parameters,) of the last
-    iterations near by, and the mean (n_parameters,) found from each.
+    explanation, under which the evaluation is. mixture: None before the first iteration; group: of the explanations
+    that it follows, None at first; settled: whether the noise is fitted, after which the objective stays as it is;
+    fits: number of iterations; moved: by how many of its standard deviations the mean moved last; frozen: the posterior
+    with the closest points and weights where the mixture is of.
     """
 
     objective: Objective
     minimum: Minimum
     mixture: Mixture | None = None
+    group: tuple[str, ...] | None = None
     settled: bool = False
     fits: int = 0
-    stayed: int = 0
     moved: float = np.inf
-    led: tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...] = ()
+    frozen: Posterior | None = None
 
     @property
     def posterior(self) -> Mixture:
@@ -123,19 +126,87 @@ def searched(
 ) -> Searched:
     """The search followed from where it has `begun` until the posterior's mean moves no more by the `rule`.
 
-    The noise is fitted anew until steps are short, or a search goes to and fro: fitted further away, it has
-    correlations of what is still motion. Then it stays, and so does the objective. begins (n_unknowns,) each: where
-    further minima are sought. One that goes round in circles goes a share of the way that falls, and ends in their
-    middle; it says so in its minimum's outcome, as one that does not end by its rule does. Raises
+    The likeliest group of explanations is followed to its best. There all others are compared, and those that may be
+    likely are followed to their own best, under the same noise: models and closest points at the best of one make
+    another look likelier than it is. One that is likelier indeed takes its place. The noise is fitted anew until steps
+    are short: fitted further away, it has correlations of what is still motion. begins (n_unknowns,) each: where
+    further minima are sought. One that does not end by its rule says so in its minimum's outcome. Raises
     `EstimationError`s of models that cannot be solved.
     """
     now = begin if begin.mixture else _with_noise(begin)
+    for change in range(CHANGES + 1):
+        now = _followed(now, bounds, rule, progress=progress, title=title, begins=begins)
+        if not now.minimum.converged:
+            return now
+        every = [now]
+        for rival in _rivals(now, bounds):
+            words = f"{title}, {', '.join(word for word in rival.group or () if word)}"
+            few, least = replace(rule, iterations=FOLLOWED), now.posterior.level - RIVAL
+            every.append(_followed(rival, bounds, few, progress=progress, title=words, least=least))
+        best = max(every, key=lambda each: each.posterior.level)
+        if best is now or change == CHANGES:
+            break
+        now = replace(best, settled=False, fits=0, minimum=replace(best.minimum, outcome=Outcome.STEPS))
+    return _ended(now, Mixture.of(of for each in every for of in each.posterior.explanations), bounds)
+
+
+def _followed(
+    now: Searched,
+    bounds: Bounds,
+    rule: StopRule,
+    *,
+    progress: Progress,
+    title: str,
+    begins: Sequence[NDArray[np.float64]] = (),
+    least: float = -np.inf,
+) -> Searched:
+    """The search within one group of explanations, followed until its mean moves no more by the `rule`.
+
+    least: level below which it is too unlikely to be followed.
+    """
     for number in range(1, rule.iterations + 1):
         progress(f"{title}, iteration {number}: {now.objective.parameters.in_words(now.minimum.unknowns)}")
         now = _iteration(now, bounds, rule, begins)
-        if now.minimum.outcome is not Outcome.STEPS:
+        if now.minimum.outcome is not Outcome.STEPS or now.posterior.level < least:
             break
     return now
+
+
+def _rivals(now: Searched, bounds: Bounds) -> list[Searched]:
+    """Where other groups of explanations are followed, those that may be likely as they are seen from its best."""
+    assert now.frozen is not None, "a search has come to its end"
+    at, n = now.minimum, now.objective.n_parameters
+    near = bounds.around(at.unknowns[:n], RADIUS)
+
+    def kept(scenario: Alternatives) -> bool:
+        """Those of other groups."""
+        return scenario.group != now.group
+
+    if not any(map(kept, scenarios_of(now.frozen.parameters.blocks))):
+        return []
+    seen = mixture_of(now.frozen, at.unknowns, at.evaluation, near, kept, of_group=OF_RIVALS)
+    found = dict[tuple[str, ...], Searched]()
+    for of in seen.explanations:
+        if of.level > now.posterior.level - RIVAL and of.group not in found:
+            own = Mixture(tuple(other for other in seen.explanations if other.group == of.group))
+            objective = now.objective.believing(of.prior(now.objective.parameters))
+            before = replace(now, objective=objective, mixture=own, group=of.group, moved=0.0)
+            found[of.group] = _taken(before, at.evaluation, of.minimum.unknowns)
+    return list(found.values())
+
+
+def _ended(now: Searched, mixture: Mixture, bounds: Bounds) -> Searched:
+    """The search where it ends: at the mean of the mixture, all else at its best under the likeliest explanation."""
+    at, objective = now.minimum, now.objective
+    assert now.frozen is not None, "a search has come to its end"
+    objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
+    theta = np.clip(mixture.mean, bounds.lower, bounds.upper)
+    start = np.concatenate([theta, mixture.minimum.unknowns[len(theta) :]])
+    own, held = now.frozen.believing(objective.parameters), Bounds(theta, theta)
+    target = gauss_newton(own, start, bounds=held, tolerance=NEAR).unknowns
+    there = _taken(replace(now, objective=objective, mixture=mixture), at.evaluation, target)
+    history = (*at.history, there.minimum.history[-1])
+    return replace(there, minimum=replace(there.minimum, outcome=at.outcome, history=history))
 
 
 def _with_noise(begin: Searched) -> Searched:
@@ -152,71 +223,50 @@ def _with_noise(begin: Searched) -> Searched:
 
 def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[NDArray[np.float64]]) -> Searched:
     """The posterior with the models exact where the search is, and the search where its mean leads."""
-    n, at = now.objective.n_parameters, now.minimum
+    n, at, blocks = now.objective.n_parameters, now.minimum, now.objective.parameters.blocks
     theta = at.unknowns[:n]
     radius = min([RADIUS, *(approximation.trust_radius for approximation in now.objective.approximations)])
     near = bounds.around(theta, radius)
     objective, evaluation = _fitted(now, near, fits=not now.settled)
     posterior = cheapest_posterior(objective, at.unknowns, evaluation)
+
+    def kept(scenario: Alternatives) -> bool:
+        """Those of the group; at first of homogeneous tissues: responses to patches are those far away."""
+        if now.group is not None:
+            return scenario.group == now.group
+        return not any(k for i, k in scenario.chosen if blocks[i].choice.of_tissues)
+
     exact = now.moved < 1.0
-    mixture = mixture_of(
-        posterior,
-        at.unknowns,
-        evaluation,
-        near,
-        begins=begins,
-        most=MOST if now.moved < 1.0 else FAR_MOST,
-        earlier=now.mixture,
-        narrowest=now.mixture is None,  # responses to patches are those of moduli that nothing speaks for
-    )
+    most = MOST if exact else FAR_MOST
+    mixture = mixture_of(posterior, at.unknowns, evaluation, near, kept, begins=begins, most=most, earlier=now.mixture)
     objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
-    share = 1.0 / max(now.stayed - PATIENCE, 1)  # evidence that changes with the place leads round in circles else
     near_end = now.moved < LAST_FIT or (exact and now.fits >= PATIENCE)
     settled = now.settled or (near_end and _change(now.objective, objective) < CALM)
+    group = mixture.explanations[0].group if now.group is None and now.fits + 1 >= FREE else now.group
     before = replace(
         now,
         objective=objective,
         mixture=mixture,
+        group=group,
         moved=moved,
         settled=settled,
         fits=now.fits + 1,
-        stayed=now.stayed + settled,
+        frozen=posterior,
     )
-    stays, circles = moved < rule.step_sd, share * moved < rule.step_sd and moved < CIRCLE
-    if (settled if rule.step_sd < LAST_FIT else exact) and (stays or circles):
-        evaluation, outcome = evaluation.under(objective.parameters, at.unknowns), Outcome.CIRCLED
-        minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED if stays else outcome)
-        return _as_likeliest(replace(before, minimum=minimum, settled=True), posterior)
-    led = (*(now.led[-MEMORY:] if exact else ()), (theta, mixture.mean))
-    goal = _fixed_point(led, sd) if share == 1.0 else theta + share * (mixture.mean - theta)
-    target = np.concatenate([np.clip(goal, near.lower, near.upper), mixture.mean_unknowns[n:]])
-    return _taken(replace(before, led=led), evaluation, target)
+    if group is not None and (settled if rule.step_sd < LAST_FIT else exact) and moved < rule.step_sd:
+        evaluation = evaluation.under(objective.parameters, at.unknowns)
+        minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
+        return replace(before, minimum=minimum, settled=True)
+    target = np.concatenate([np.clip(mixture.mean, near.lower, near.upper), mixture.mean_unknowns[n:]])
+    return _taken(before, evaluation, target)
 
 
 def _change(before: Objective, objective: Objective) -> float:
     """Largest change of ln of what a residual of any observation weighs."""
     was, now = (np.log([o.weighting.precision for o in of.observations]) for of in (before, objective))
     return float(np.abs(now - was).max(initial=0.0))
-
-
-def _fixed_point(
-    led: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], sd: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Theta (n_parameters,) from which the mean should lead nowhere, by where the last iterations led.
-
-    Anderson's acceleration (Walker & Ni, SIAM J. Numer. Anal. 49 (2011) 1715) in standard deviations (n_parameters,):
-    without it a search goes to and fro where the responses to patchy tissues depend much on the moduli.
-    """
-    scale = np.where(np.isfinite(sd), sd, 1.0)  # a modulus that moves nothing has none
-    places, means = (np.stack(each) / scale for each in zip(*led, strict=True))
-    ways = means - places
-    if len(led) == 1:
-        return np.asarray(means[-1] * scale)
-    by_places, by_ways = np.diff(places, axis=0).T, np.diff(ways, axis=0).T
-    shares = np.linalg.lstsq(by_ways, ways[-1], rcond=DEPENDENT)[0]
-    return np.asarray((means[-1] - (by_places + by_ways) @ shares) * scale)
 
 
 def _fitted(now: Searched, near: Bounds, *, fits: bool) -> tuple[Objective, Evaluation]:
@@ -241,20 +291,10 @@ def _fitted(now: Searched, near: Bounds, *, fits: bool) -> tuple[Objective, Eval
     return objective, objective.weighed(at.unknowns, at.evaluation.linearisations, like)
 
 
-def _as_likeliest(end: Searched, posterior: Posterior) -> Searched:
-    """The search where it ends, all unknowns but the moduli at their best under the likeliest explanation."""
-    at, objective = end.minimum, end.objective
-    theta = at.unknowns[: objective.n_parameters]
-    start = np.concatenate([theta, end.posterior.minimum.unknowns[len(theta) :]])
-    target = gauss_newton(posterior.believing(objective.parameters), start, bounds=Bounds(theta, theta), tolerance=NEAR)
-    there = _taken(end, at.evaluation, target.unknowns)
-    history = (*at.history[:-1], there.minimum.history[-1])
-    return replace(there, minimum=replace(there.minimum, outcome=at.outcome, history=history))
-
-
 def _taken(now: Searched, evaluation: Evaluation, target: NDArray[np.float64]) -> Searched:
     """The search at a target (n_unknowns,), or nearer where its state cannot be solved."""
-    at, objective, failure = now.minimum, now.objective, SolverError("no step was tried")
+    at, objective = now.minimum, now.objective
+    failure: EstimationError = SolverError("no step was tried")
     believed = evaluation.under(objective.parameters, at.unknowns)
     for _ in range(HALVINGS):
         try:

@@ -1,7 +1,7 @@
 """Reduced models: Galerkin projection on a basis of displacements, whose online cost forgets the mesh.
 
-u = F V a + M q + o with V^T K_ff(E) V a = V^T F^T (f - K(E) (M q + o) - G(E) c); all blocks are affine in the moduli and
-kept densely, one for each region, the loads' once. G(E) c are the forces of a material that differs by c, at one
+u = F V a + M q + o with V^T K_ff(E) V a = V^T F^T (f - K(E) (M q + o) - G(E) c); all blocks are affine in the moduli
+and kept densely, one for each region, the loads' once. G(E) c are the forces of a material that differs by c, at one
 displacement. Quarteroni, Manzoni & Negri, Reduced Basis Methods (2016), chapter 3.
 """
 

@@ -58,7 +58,7 @@ class Choice(Enum):
     NONE = "there is one"
     PATCHINESS = "the same of all tissues"
     LAYERS = "the same of all organs"
-    FRAME = "one of each block, in each image"
+    FRAME = "the same in all later images"
     DRAWING = "of an image's surfaces none, one or all are drawn otherwise"
     HELD = "the block is held at its mean, and what it may be counts in the covariance (Schmidt 1966)"
 
@@ -70,7 +70,7 @@ class Choice(Enum):
     @property
     def of_image(self) -> bool:
         """Whether every later image has a choice of its own."""
-        return self in (Choice.FRAME, Choice.DRAWING)
+        return self is Choice.DRAWING
 
 
 @dataclass(frozen=True)
