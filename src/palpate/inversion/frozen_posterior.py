@@ -6,7 +6,7 @@ reduced model it is a quadratic form in the model's amplitudes: an evaluation fo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -20,6 +20,7 @@ from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.reduced import ReducedModel, common_vectors
+from palpate.observation.jacobian import Jacobian
 from palpate.unknowns.parameters import ParameterMap
 
 ONE = np.ones(1)  # the coordinate of what no unknown moves
@@ -120,6 +121,13 @@ class FrozenState:
     square: NDArray[np.float64]
     common: int = 0
 
+    def pulled(self, pull: NDArray[np.float64]) -> FrozenState:
+        """The same with a form that is z^T y larger, y = `pull` (k - 1,) by all coordinates but the last."""
+        form = self.form.copy()
+        form[:-1, -1] += pull
+        form[-1, :-1] += pull
+        return replace(self, form=form)
+
     def coordinates(
         self,
         amplitude: NDArray[np.float64],
@@ -217,6 +225,15 @@ class FrozenPosterior:
         """The same under another prior of its unknowns."""
         return replace(self, parameters=parameters)
 
+    def pulled(self, pulls: Sequence[NDArray[np.float64]], amount: float) -> FrozenPosterior:
+        """The same with residuals that pull by `amount` times y (k - 1,) of each state more (see `pulls_of`)."""
+        pairs = zip(self.states, pulls, strict=True)
+        return replace(self, states=tuple(state.pulled(amount * pull) for state, pull in pairs))
+
+    def alone(self, number: int) -> FrozenPosterior:
+        """That of one state, of the unknowns of `ParameterMap.alone`."""
+        return FrozenPosterior(self.parameters.alone(number)[0], (replace(self.states[number], common=0),))
+
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """Its value, score and Gauss-Newton matrix at unknowns (n,), without residuals; raises `SolverError`.
 
@@ -239,18 +256,21 @@ class FrozenPosterior:
         return Evaluation(value, misfit, score, prior.plus(blocks), (), prior, pull, believed)
 
 
-def frozen_posterior(
-    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None
-) -> FrozenPosterior:
-    """The posterior with the closest points and weights at `unknowns` (n,), under the objective's own prior of them.
+@dataclass(frozen=True, slots=True)
+class _SeenState:
+    """A state to be frozen: `bare` of forms, its z (k,) there, and of each observation a term and its S dr/dz."""
 
-    Residuals are point-to-plane, r + n.(u - u_0), as in the Gauss-Newton matrix. evaluation: that of the objective
-    there, where it is known. Raises `ConfigurationError` for models that are neither reduced ones nor bent by one.
-    """
-    evaluation = evaluation or objective(unknowns)
+    bare: FrozenState
+    z: NDArray[np.float64]
+    terms: tuple[tuple[Linearisation, Jacobian], ...]
+
+
+def _seen_states(
+    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation
+) -> Iterator[_SeenState]:
+    """What is frozen of one state after the other at unknowns (n,); raises as `frozen_posterior`."""
     parameters = objective.parameters
     moduli, coefficients = parameters.moduli(unknowns), parameters.coefficients(unknowns)
-    states = list[FrozenState]()
     for s, model in enumerate(fixed_correspondence(objective, unknowns, evaluation).models):
         reduced = model.like if isinstance(model, CurvedModel) else model
         if not isinstance(reduced, ReducedModel):
@@ -273,7 +293,7 @@ def frozen_posterior(
         alone = replace(alone, coupling=np.ascontiguousarray(alone.coupling))
         bare = FrozenState(alone, expanded, *(np.zeros((0, 0)),) * 2)
         z = bare.coordinates(bare.reduced.solve(moduli, coefficients[s]).amplitude, moduli, coefficients[s], offsets)
-        form, square = np.zeros((len(z), len(z))), np.zeros((len(z), len(z)))
+        terms = list[tuple[Linearisation, Jacobian]]()
         for rows, term in zip(objective.states[s].slices, linearisations, strict=True):
             of_offsets = term.jacobian.tangent[:, term.jacobian.shape[1] - len(offsets) :]
             below = np.zeros((len(of_offsets) - len(answer[rows]), answer.shape[1]))
@@ -282,15 +302,56 @@ def frozen_posterior(
                 below[1 : 1 + n_regions, -n_regions:] = np.eye(n_regions)
                 below[1 + n_regions :, first : first + len(below) - 1 - n_regions] = np.eye(len(below) - 1 - n_regions)
             moved = np.concatenate([np.concatenate([answer[rows], below]), of_offsets], axis=1)
-            by_z = replace(term.jacobian, tangent=moved)
-            rest = term.residuals.values - by_z.times(z[:-1])
+            terms.append((term, replace(term.jacobian, tangent=moved)))
+        yield _SeenState(bare, z, tuple(terms))
+
+
+def frozen_posterior(
+    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None
+) -> FrozenPosterior:
+    """The posterior with the closest points and weights at `unknowns` (n,), under the objective's own prior of them.
+
+    Residuals are point-to-plane, r + n.(u - u_0), as in the Gauss-Newton matrix. evaluation: that of the objective
+    there, where it is known. Raises `ConfigurationError` for models that are neither reduced ones nor bent by one.
+    """
+    evaluation = evaluation or objective(unknowns)
+    states = list[FrozenState]()
+    for seen in _seen_states(objective, unknowns, evaluation):
+        form, square = np.zeros((len(seen.z), len(seen.z))), np.zeros((len(seen.z), len(seen.z)))
+        for term, by_z in seen.terms:
+            rest = term.residuals.values - by_z.times(seen.z[:-1])
             side = by_z.transposed_times(term.weights * rest)[:, None]
             own = np.block([[by_z.gram(term.weights), side], [side.T, float(term.weights @ rest**2)]])
             form += term.precision * own
             square += own / len(evaluation.linearisations)
-        common = common_vectors(states[0].reduced, bare.reduced) if states else 0
-        states.append(replace(bare, form=form, square=square, common=common))
-    return FrozenPosterior(parameters, tuple(states))
+        common = common_vectors(states[0].reduced, seen.bare.reduced) if states else 0
+        states.append(replace(seen.bare, form=form, square=square, common=common))
+    return FrozenPosterior(objective.parameters, tuple(states))
+
+
+def pulls_of(
+    objective: Objective,
+    unknowns: NDArray[np.float64],
+    evaluation: Evaluation,
+    changes: Sequence[Sequence[NDArray[np.float64]]],
+) -> list[tuple[NDArray[np.float64], ...]]:
+    """How residuals pull that change: of each of several changes e (n,) mm of each observation, y (k - 1,) by state.
+
+    y = sum W S^T e by the coordinates z, so that the objective changes by z^T y but for a constant. Of the posterior
+    that is frozen there; raises as `frozen_posterior`.
+    """
+    found: list[list[NDArray[np.float64]]] = [[] for _ in changes]
+    first = 0
+    for seen in _seen_states(objective, unknowns, evaluation):
+        own = slice(first, first + len(seen.terms))
+        first = own.stop
+        for of_change, change in zip(found, changes, strict=True):
+            pulls = (
+                by_z.transposed_times(term.precision * term.weights * e)
+                for (term, by_z), e in zip(seen.terms, change[own], strict=True)
+            )
+            of_change.append(np.sum(list(pulls), axis=0))
+    return [tuple(of_change) for of_change in found]
 
 
 class Posterior(LeastSquares, Protocol):

@@ -76,7 +76,7 @@ def conclude(
     posterior = as_stated(inversion, own, settings.bounds)
     covariance = posterior.mixture.covariance
     progress("intervals: profiles, and the fit of every surface before and after")
-    pairs = image_pairs_of(inversion, settings.bounds, errors)
+    pairs = image_pairs_of(inversion, settings.bounds, errors, posterior.frozen)
     known = intervals_of(inversion, settings, posterior)
     fits, forces, points = _seen(inversion, observed)
     misfits = misfits_of(minimum.evaluation.linearisations, points, observed.states[0].space.mesh.tissues)

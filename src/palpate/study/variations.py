@@ -158,7 +158,7 @@ def what_would_change(
 
     changes: list[tuple[tuple[str, str, str], Callable[[], Shift]]] = [
         ((each.cause, each.subject, words), partial(path.shift, pulled(amount)))
-        for each, pulled in zip(inputs, mapped(lambda each: path.pulled(each.errors), inputs), strict=True)
+        for each, pulled in zip(inputs, path.pulled([each.errors for each in inputs]), strict=True)
         for amount, words in each.amounts
     ]
     frame = np.concatenate([np.zeros(0, dtype=bool), *(np.full(b.size, b.cause == "frame") for b in blocks)])
@@ -167,7 +167,7 @@ def what_would_change(
 
     def under(law: Law) -> Callable[[], Shift]:
         """What a step to another law's equilibrium does."""
-        return lambda: path.shift(path.pulled(law_errors(minimum.evaluation, equilibria, law, dilatation))(1.0))
+        return lambda: path.shift(path.pulled([law_errors(minimum.evaluation, equilibria, law, dilatation)])[0](1.0))
 
     bound = any(isinstance(o, OfMaterial) for o in inversion.objective.observations)
     changes += [(("law", "", law.name), under(law)) for law in laws if not bound]

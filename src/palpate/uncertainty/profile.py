@@ -17,6 +17,7 @@ from palpate.errors import SolverError
 from palpate.inversion import (
     Bounds,
     FixedCorrespondence,
+    FrozenPosterior,
     LeastSquares,
     LinearisedObjective,
     Minimum,
@@ -24,6 +25,7 @@ from palpate.inversion import (
     Outcome,
     fixed_correspondence,
     gauss_newton,
+    newton_step,
     posterior_sd,
     with_correlations,
     with_scales,
@@ -120,7 +122,12 @@ class Ray:
         return slope
 
     def _at_its_best(self, start: NDArray[np.float64]) -> Minimum:
-        """The minimum over all that is not held, sought from unknowns (n,), and again from where a search stopped."""
+        """The minimum over all that is not held, sought from unknowns (n,), and again from where a search stopped.
+
+        Where all log-moduli are held, a frozen posterior is a parabola of the others: one step leads to its minimum.
+        """
+        if self.held.all() and isinstance(self.fixed, FrozenPosterior):
+            return _at_held_moduli(self.fixed, start)
         bounds = self.bounds.fixed(start[: len(self.held)], self.held)
         for _ in range(TRIES):
             found = gauss_newton(self.fixed, start, bounds=bounds, tolerance=ON_RAY)
@@ -172,6 +179,15 @@ class Ray:
                 (near, low), (far, high) = inside, outside
                 distance = near + (far - near) * float(np.clip((level - low) / (high - low), 0.1, 0.9))
         return points, distance
+
+
+def _at_held_moduli(posterior: FrozenPosterior, start: NDArray[np.float64]) -> Minimum:
+    """The minimum over all but the log-moduli of unknowns (n,), with the evaluation at `start` but for the value."""
+    there, n = posterior(start), posterior.n_parameters
+    step = newton_step(there, np.arange(len(start)) >= n, n)
+    least = replace(there, value=there.value + 0.5 * float(there.score @ step))
+    outcome = Outcome.CONVERGED if np.isfinite(least.value) else Outcome.NOT_FINITE
+    return Minimum(start + step, least, outcome, (), 1)
 
 
 def refitted(

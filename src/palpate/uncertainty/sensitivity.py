@@ -24,8 +24,8 @@ from palpate.inversion import (
     Objective,
     Posterior,
     cheapest_posterior,
-    frozen_posterior,
     gauss_newton,
+    pulls_of,
 )
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel, finite_strain_model
@@ -79,18 +79,18 @@ class FastPath:
         moved = replace(self.minimum, evaluation=_moved(self.minimum.evaluation, errors))
         return self._shift(refitted(self.objective, moved, self.bounds, max_steps=STEPS, passes=passes)[0])
 
-    def pulled(self, errors: Errors) -> Callable[[float], Posterior]:
-        """The posterior by its amount, whose residuals change by that many times e (n,) mm, of each observation."""
+    def pulled(self, changes: Sequence[Errors]) -> list[Callable[[float], Posterior]]:
+        """Of several changes the posterior by its amount, whose residuals change by that many times e (n,) mm."""
         at, evaluation, held = self.minimum.unknowns, self.minimum.evaluation, self.posterior
-        if not isinstance(held, FrozenPosterior):
-            return lambda amount: cheapest_posterior(
-                self.objective, at, _moved(evaluation, tuple(amount * error for error in errors))
-            )
-        ends = frozen_posterior(self.objective, at, _moved(evaluation, errors)).states
-        ways = [(state, end.form - state.form) for state, end in zip(held.states, ends, strict=True)]
-        return lambda amount: replace(
-            held, states=tuple(replace(state, form=state.form + amount * way) for state, way in ways)
-        )
+        if isinstance(held, FrozenPosterior):
+            return [partial(held.pulled, pulls) for pulls in pulls_of(self.objective, at, evaluation, changes)]
+
+        def moved(errors: Errors, amount: float) -> Posterior:
+            """The posterior under one change, made anew."""
+            changed = tuple(amount * error for error in errors)
+            return cheapest_posterior(self.objective, at, _moved(evaluation, changed))
+
+        return [partial(moved, errors) for errors in changes]
 
     def shift(
         self, posterior: Posterior | None = None, *, width: float = 1.0, dropped: NDArray[np.bool_] | None = None
