@@ -265,9 +265,7 @@ class _SeenState:
     terms: tuple[tuple[Linearisation, Jacobian], ...]
 
 
-def _seen_states(
-    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation
-) -> Iterator[_SeenState]:
+def _seen_states(objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation) -> Iterator[_SeenState]:
     """What is frozen of one state after the other at unknowns (n,); raises as `frozen_posterior`."""
     parameters = objective.parameters
     moduli, coefficients = parameters.moduli(unknowns), parameters.coefficients(unknowns)

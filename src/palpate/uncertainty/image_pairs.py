@@ -84,8 +84,9 @@ def pair_estimates(
 
     The covariance has parts by noise and prior, by blocks that are held, by the place of the grid (see
     `grid_covariance`), and by the mesh, which those of one reference share.
-    errors: of the residuals on random grids (see `grid_errors`). Nothing is solved; the approximations of the joint
-    estimate stand. frozen: its posterior with these held, where it is known. Raises `EstimationError` where a state alone leaves a driver's motion open.
+    errors: of the residuals on random grids (see `grid_errors`); frozen: the posterior, where it is known as a frozen
+    one. Nothing is solved; the approximations of the joint estimate stand. Raises `EstimationError` where a state alone
+    leaves a driver's motion open.
     """
     alone = _each_alone(objective, minimum, bounds, frozen)
     noise, prior = _noise_and_prior(objective, alone)
