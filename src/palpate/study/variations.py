@@ -16,6 +16,7 @@ from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.laws.contract import Law
 from palpate.observation.contract import Imaged, OfMaterial
 from palpate.parallel import mapped
+from palpate.study.stated_posterior import StatedPosterior
 from palpate.uncertainty import (
     Equilibria,
     Errors,
@@ -141,13 +142,17 @@ def what_would_change(
     *,
     dilatation: Dilatation,
     voxel_mm: float,
+    posterior: StatedPosterior | None = None,
 ) -> tuple[Variation, ...]:
     """What an estimate rests on, in few lines: known modulus, surfaces by half a voxel, Poisson's ratios, frame, law.
 
     laws: others than that of the estimate, which none has that measures what depends on the material directly, as a
-    force does; otherwise as `fast_variations`.
+    force does; posterior: what is stated of the estimate, where it is there; otherwise as `fast_variations`.
     """
-    path, minimum = fast_path(inversion.objective, inversion.minimum, settings.bounds), inversion.minimum
+    objective, minimum, known = inversion.objective, inversion.minimum, None
+    if posterior is not None and posterior.objective is not None:
+        objective, known = posterior.objective, (posterior.frozen, posterior.minimum)
+    path = fast_path(objective, minimum, settings.bounds, known)
     names, equilibria = inversion.objective.parameters.tissues, _equilibria(inversion)
     blocks = inversion.objective.parameters.blocks
     inputs = [

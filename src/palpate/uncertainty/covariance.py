@@ -29,6 +29,7 @@ GridErrors = Sequence[Sequence[NDArray[np.float64]]]
 
 GRID_DRAWS = 8
 ROUNDING = 1e-6  # share of a variance that is only rounding, as of blocks that are held
+TOLD = 1e-3  # share of the images in what is known of a combination, below which the fit takes no errors for it
 MARGIN_MM, MARGIN_VOXELS = 12.0, 8.0  # of the grid around the residuals' places, wider than the maps' smoothing
 
 
@@ -282,13 +283,16 @@ def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
     linearisations, found = evaluation.linearisations, {}
     inverse = evaluation.covariance_columns(evaluation.matrix.size)
     for key, (own, telling) in of_one_noise(evaluation).items():
-        gains, columns = list[Jacobian](), linearisations[own[0]].columns
-        for term in (linearisations[i] for i in own):  # W J H^-1, its part of the gain's transpose
+        columns = linearisations[own[0]].columns
+        of_images = sum((linearisations[i].information for i in own), np.zeros(2 * (len(columns),)))
+        told = _told(inverse[np.ix_(columns, columns)], of_images)
+        gains = list[Jacobian]()
+        for term in (linearisations[i] for i in own):  # W J T, its part of the gain's transpose
             weights = sparse.diags_array(term.precision * term.weights)
             seen = sparse.csr_matrix(weights @ term.jacobian.by_displacement)
-            gains.append(Jacobian(seen, term.jacobian.tangent @ inverse[np.ix_(columns, columns)]))
+            gains.append(Jacobian(seen, term.jacobian.tangent @ told))
         response = FitResponse(
-            [linearisations[i].jacobian for i in telling],
+            [replace(of := linearisations[i].jacobian, tangent=of.tangent @ told) for i in telling],
             gains,
             places=[linearisations[i].residuals.material for i in own],
             normals=[linearisations[i].residuals.normals for i in own],
@@ -296,6 +300,21 @@ def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
         found[key] = linearisations[own[0]].observation.fitted_noise(
             [linearisations[i].residuals for i in telling], response
         )
+    return found
+
+
+def _told(covariance: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """T (n, k) of combinations of unknowns with T T^T = C (n, n) but for what images do not tell.
+
+    The combinations are independent of each other under the covariance C and under the images' information (n, n), of
+    which each has a share h = T^T M T in what is known of it, and those with hardly any are left out.
+    """
+    known = np.isfinite(np.diag(covariance))
+    sizes, axes = np.linalg.eigh(covariance[np.ix_(known, known)])
+    root = axes * np.sqrt(np.maximum(sizes, 0.0))
+    shares, turn = np.linalg.eigh(root.T @ information[np.ix_(known, known)] @ root)
+    found = np.zeros((len(known), np.count_nonzero(shares > TOLD)))
+    found[known] = root @ turn[:, shares > TOLD]
     return found
 
 

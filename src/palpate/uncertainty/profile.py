@@ -7,6 +7,7 @@ Of two moduli it is a region, drawn beside the ellipse.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,7 +36,8 @@ TRIALS = 12  # points on a ray from the estimate
 DIRECTIONS = 16  # of a joint region
 JOINT_LEVEL = float(np.sqrt(special.chdtri(2, 0.05)))  # root deviance on its boundary: two degrees of freedom
 TRIES = 3  # searches at a point, each with as many steps as a minimum
-NEAR = 0.05  # of the level: accuracy of an end before a straight line corrects it
+NEAR = 0.05  # of the level: accuracy of an end before the line through the last two points corrects it
+NEARER = 0.02  # before the line through the minimum and the only point does
 FURTHEST = 2.0  # largest extrapolation, times the distance of the last point
 PASSES = 10
 SETTLED = 0.02  # posterior standard deviations
@@ -165,8 +167,8 @@ class Ray:
                 return points, None
             points.append((distance, root, found.unknowns))
             slope = (found.unknowns - least) / distance
-            if abs(root - level) < NEAR * level:
-                return points, distance * level / root
+            if abs(root - level) < (NEAR if len(points) > 1 else NEARER) * level:
+                return points, _on_line(points, level)
             if root < level:
                 if at_bound:
                     return points, None
@@ -179,6 +181,13 @@ class Ray:
                 (near, low), (far, high) = inside, outside
                 distance = near + (far - near) * float(np.clip((level - low) / (high - low), 0.1, 0.9))
         return points, distance
+
+
+def _on_line(points: Sequence[RayPoint], level: float) -> float:
+    """Where a line through the last two points, or the minimum and the only one, meets the level of the root."""
+    (near, low, _), (far, high, _) = points[-2:] if len(points) > 1 else ((0.0, 0.0, None), points[0])
+    rise = (high - low) / (far - near)
+    return far + (level - high) / (rise if rise > 0.1 * high / far else high / far)
 
 
 def _at_held_moduli(posterior: FrozenPosterior, start: NDArray[np.float64]) -> Minimum:
@@ -242,14 +251,15 @@ def joint_region(
     least, pair = gauss_newton(fixed, minimum.unknowns, bounds=bounds, tolerance=1e-6), list(numbers)
     own = least.evaluation.covariance_columns(fixed.n_parameters)[np.ix_(pair, pair)]
     held = np.isin(np.arange(fixed.n_parameters), pair)
-    centre, edge, cut = least.unknowns[pair], list[NDArray[np.float64]](), False
+    centre, edge, cut, first = least.unknowns[pair], list[NDArray[np.float64]](), False, JOINT_LEVEL
     angles = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ np.linalg.cholesky(covariance).T  # V^-1 norm 1
     for along in directions:
         direction = np.zeros(fixed.n_parameters)
         direction[pair] = along
         ray = Ray(fixed, least, direction, held, bounds, 1.0 / float(along @ np.linalg.solve(own, along)))
-        points, end = ray.to_level(JOINT_LEVEL, first=JOINT_LEVEL)
+        points, end = ray.to_level(JOINT_LEVEL, first=first)  # the boundary is smooth: from where the last one lay
+        first = end or JOINT_LEVEL
         reached = end if end is not None else max((distance for distance, *_ in points), default=0.0)
         cut = cut or end is None
         edge.append(centre + reached * along)

@@ -126,10 +126,15 @@ def _moved(evaluation: Evaluation, errors: Errors) -> Evaluation:
     return replace(evaluation, linearisations=tuple(term.with_errors(error) for term, error in pairs))
 
 
-def fast_path(objective: Objective, minimum: Minimum, bounds: Bounds) -> FastPath:
-    """That of an estimate; raises as `gauss_newton` does."""
-    posterior = cheapest_posterior(objective, minimum.unknowns, minimum.evaluation)
-    least = gauss_newton(posterior, minimum.unknowns, bounds=bounds, tolerance=TOLERANCE)
+def fast_path(
+    objective: Objective, minimum: Minimum, bounds: Bounds, known: tuple[Posterior, Minimum] | None = None
+) -> FastPath:
+    """That of an estimate; raises as `gauss_newton` does.
+
+    known: the posterior with closest points and weights held, and its minimum, where these are there.
+    """
+    posterior, begin = known or (cheapest_posterior(objective, minimum.unknowns, minimum.evaluation), minimum)
+    least = gauss_newton(posterior, begin.unknowns, bounds=bounds, tolerance=TOLERANCE)
     return FastPath(objective, minimum, posterior, least, bounds)
 
 
