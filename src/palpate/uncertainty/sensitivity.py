@@ -27,6 +27,7 @@ from palpate.inversion import (
     gauss_newton,
     pulls_of,
 )
+from palpate.mechanics.chord import chord_equilibria
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel, finite_strain_model
 from palpate.mechanics.hyperelastic import elements_of
@@ -40,6 +41,7 @@ from palpate.uncertainty.profile import PASSES, refitted
 
 TOLERANCE = 1e-6  # decrement of a minimum
 STEPS = 120  # at the most, for a modulus that moves far
+SIDE_BY_SIDE, CHORDS = 1e-2, 12  # of the forces, where images of one body go there together, and their iterations
 COARSE = NewtonSettings(tolerance=2e-2, step_tolerance=2e-2)  # of the forces, under another law
 DERIVATIVES = 1e-4  # relative residual of those by Poisson's ratios
 ITERATIONS = 120  # with a factorisation of other moduli
@@ -220,24 +222,56 @@ def law_errors(
 ) -> Errors:
     """Changes (n,) mm of each observation's residuals when the bodies follow another law at the same moduli.
 
-    Newton's method leads from each equilibrium to that of the other law, with the factorisation that is there. Raises
-    `NotConverged` where there is none.
+    From each equilibrium to that of the other law with the factorisation that is there: images of one body side by side
+    (see `chord_equilibria`), by Newton's method where that does not lead there. Raises `NotConverged` where there is no
+    such equilibrium.
     """
-    changes, made = list[NDArray[np.float64]](), dict[int, FiniteStrainModel]()
-    for there in equilibria:
+    changes, linear = dict[int, NDArray[np.float64]](), dict[int, LinearEquilibrium]()
+    for s, there in enumerate(equilibria):
         if isinstance(there, FiniteStrainEquilibrium):
             exact = there if there.factorisation else there.refactorised()
             other = replace(exact.model, elements=elements_of(exact.model.space, law, dilatation))
-            moduli, factorisation = exact.moduli, exact.factorisation
+            changes[s] = _newton_change(other, exact, exact.moduli, exact.factorisation)
         else:
-            model, moduli, factorisation = there.system.model, there.system.moduli, there.system.factorisation
-            if id(model.space) not in made:  # later images of one body differ in what is prescribed
-                made[id(model.space)] = finite_strain_model(model.space, model.constraint, law, dilatation=dilatation)
-            other = replace(made[id(model.space)].under(model.conditions), material=model.material)
-        coarse = replace(other, settings=COARSE)
-        found = coarse.solve(moduli, there.coefficients, start=there.displacement, nearby=factorisation)
-        changes.append(np.asarray(found.values - there.values))
-    return _of_displacements(evaluation, changes)
+            linear[s] = there
+    while linear:
+        first = next(iter(linear.values())).system
+        alike = [
+            s
+            for s, there in linear.items()
+            if first.model.same_stiffness(there.system.model) and np.array_equal(first.moduli, there.system.moduli)
+        ]
+        made = finite_strain_model(first.model.space, first.model.constraint, law, dilatation=dilatation)
+        of_states = [linear.pop(s) for s in alike]
+        others = [
+            replace(made.under(of.system.model.conditions), material=of.system.model.material) for of in of_states
+        ]
+        found = chord_equilibria(
+            [
+                other.balance(first.moduli, of.coefficients[other.constraint.n_modes :])
+                for other, of in zip(others, of_states, strict=True)
+            ],
+            [of.values for of in of_states],
+            first.factorisation,
+            tolerance=SIDE_BY_SIDE,
+            iterations=CHORDS,
+        )
+        for s, other, of, values in zip(alike, others, of_states, found, strict=True):
+            newton = values is None
+            changes[s] = _newton_change(other, of, first.moduli, first.factorisation) if newton else values - of.values
+    return _of_displacements(evaluation, [changes[s] for s in range(len(equilibria))])
+
+
+def _newton_change(
+    other: FiniteStrainModel,
+    there: LinearEquilibrium | FiniteStrainEquilibrium,
+    moduli: NDArray[np.float64],
+    nearby: Factorisation | None,
+) -> NDArray[np.float64]:
+    """Change (n_dof,) mm from an equilibrium to that of another model; raises `NotConverged`."""
+    coarse = replace(other, settings=COARSE)
+    found = coarse.solve(moduli, there.coefficients, start=there.displacement, nearby=nearby)
+    return np.asarray(found.values - there.values)
 
 
 def _of_displacements(evaluation: Evaluation, changes: Sequence[NDArray[np.float64]]) -> Errors:
