@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
@@ -20,9 +21,11 @@ from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.reduced import ReducedModel, common_vectors
+from palpate.mechanics.solvers.cholesky import forward, lower_factor
 from palpate.observation.jacobian import Jacobian
 from palpate.unknowns.parameters import ParameterMap
 
+ROUNDING = 1e-13  # of the largest number on the diagonal of a form that has no inverse
 ONE = np.ones(1)  # the coordinate of what no unknown moves
 
 
@@ -111,15 +114,37 @@ class FrozenState:
 
     Offsets of the residuals, and modes of surfaces at rest, stand before the 1. expanded (n_regions,) kPa: E_0 where an
     expansion adds to the model, z = [a, q, ln E - ln E_0, 1]; form: Q (k, k), the residuals' part of the objective is
-    1/2 z^T Q z; square: S (k, k), their mean square is z^T S z, mm^2; common: how many first basis vectors are those of
-    the first state.
+    1/2 z^T Q z; square: S (k, k), their mean square is z^T S z, mm^2; root, beside, left: upper R_a (m, m), R_l^T and
+    Q_l of the others z_l, with which it is 1/2 |R_a a + R_l z_l|^2 + 1/2 z_l^T Q_l z_l but for what is linear in z;
+    common: how many first basis vectors are those of the first state.
     """
 
     reduced: ReducedModel
     expanded: NDArray[np.float64] | None
     form: NDArray[np.float64]
     square: NDArray[np.float64]
+    root: NDArray[np.float64]
+    beside: NDArray[np.float64]
+    left: NDArray[np.float64]
     common: int = 0
+
+    @classmethod
+    def of(
+        cls,
+        reduced: ReducedModel,
+        expanded: NDArray[np.float64] | None,
+        form: NDArray[np.float64],
+        square: NDArray[np.float64],
+        common: int,
+    ) -> FrozenState:
+        """That of a form, with its root: Q_aa = R_a^T R_a by Cholesky, up to rounding, and R_a^T R_l = Q_al."""
+        m = reduced.n_basis
+        own, across = form[:m, :m].copy(), form[:m, m:-1]
+        own[np.diag_indices(m)] += ROUNDING * float(np.diag(own).max(initial=0.0)) + np.finfo(np.float64).tiny
+        factor = lower_factor(own)
+        beside = np.ascontiguousarray(forward(factor, across).T)
+        left = form[m:-1, m:-1] - beside @ beside.T
+        return cls(reduced, expanded, form, square, np.asfortranarray(factor.T), beside, left, common)
 
     def pulled(self, pull: NDArray[np.float64]) -> FrozenState:
         """The same with a form that is z^T y larger, y = `pull` (k - 1,) by all coordinates but the last."""
@@ -157,14 +182,12 @@ class FrozenState:
     ) -> NDArray[np.float64]:
         """D^T Q D (n_own, n_own), of the same derivatives D = [A; B], B of all coordinates but the amplitudes.
 
-        It is B^T Q_bb B + W + W^T with W = A^T (Q_aa A / 2 + Q_ab B), and B is of zeros and ones but for ln E.
+        It is Z^T Z + B^T Q_l B with Z = R_a A + R_l B, R_a triangular, and B is of zeros and ones but for ln E.
         """
-        m, n = amplitude_slopes.shape
-        across = self._by_others(self.form[m:-1, :m], modulus_slopes)
-        across[:n] += (0.5 * amplitude_slopes.T) @ self.form[:m, :m]
-        found, half = self._of_others(self.form[m:-1, m:-1], modulus_slopes), across @ amplitude_slopes
-        found[:, :n] += half
-        found[:n] += half.T
+        half = self._by_others(self.beside, modulus_slopes)
+        half[: amplitude_slopes.shape[1]] += linalg.blas.dtrmm(1.0, self.root, amplitude_slopes).T
+        found = self._of_others(self.left, modulus_slopes)
+        found += half @ half.T
         return found
 
     def _of_others(self, values: NDArray[np.float64], modulus_slopes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -289,7 +312,7 @@ def _seen_states(objective: Objective, unknowns: NDArray[np.float64], evaluation
         offsets = parameters.offsets(unknowns, s)
         alone = reduced.outputs(lambda values: values[:0])
         alone = replace(alone, coupling=np.ascontiguousarray(alone.coupling))
-        bare = FrozenState(alone, expanded, *(np.zeros((0, 0)),) * 2)
+        bare = FrozenState(alone, expanded, *(np.zeros((0, 0)),) * 5)
         z = bare.coordinates(bare.reduced.solve(moduli, coefficients[s]).amplitude, moduli, coefficients[s], offsets)
         terms = list[tuple[Linearisation, Jacobian]]()
         for rows, term in zip(objective.states[s].slices, linearisations, strict=True):
@@ -323,7 +346,7 @@ def frozen_posterior(
             form += term.precision * own
             square += own / len(evaluation.linearisations)
         common = common_vectors(states[0].reduced, seen.bare.reduced) if states else 0
-        states.append(replace(seen.bare, form=form, square=square, common=common))
+        states.append(FrozenState.of(seen.bare.reduced, seen.bare.expanded, form, square, common))
     return FrozenPosterior(objective.parameters, tuple(states))
 
 
