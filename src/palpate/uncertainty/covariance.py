@@ -284,8 +284,8 @@ def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
     inverse = evaluation.covariance_columns(evaluation.matrix.size)
     for key, (own, telling) in of_one_noise(evaluation).items():
         columns = linearisations[own[0]].columns
-        of_images = sum((linearisations[i].information for i in own), np.zeros(2 * (len(columns),)))
-        told = _told(inverse[np.ix_(columns, columns)], of_images)
+        of_data = evaluation.matrix.block(columns, columns) - evaluation.prior.block(columns, columns)
+        told = _told(inverse[np.ix_(columns, columns)], of_data)
         gains = list[Jacobian]()
         for term in (linearisations[i] for i in own):  # W J T, its part of the gain's transpose
             weights = sparse.diags_array(term.precision * term.weights)
