@@ -149,10 +149,10 @@ def what_would_change(
     laws: others than that of the estimate, which none has that measures what depends on the material directly, as a
     force does; posterior: what is stated of the estimate, where it is there; otherwise as `fast_variations`.
     """
-    objective, minimum, known = inversion.objective, inversion.minimum, None
-    if posterior is not None and posterior.objective is not None:
-        objective, known = posterior.objective, (posterior.frozen, posterior.minimum)
-    path = fast_path(objective, minimum, settings.bounds, known)
+    minimum, known = inversion.minimum, None
+    if posterior is not None and posterior.objective is inversion.objective:  # no model was made more exact since
+        known = posterior.frozen, posterior.minimum
+    path = fast_path(inversion.objective, minimum, settings.bounds, known)
     names, equilibria = inversion.objective.parameters.tissues, _equilibria(inversion)
     blocks = inversion.objective.parameters.blocks
     inputs = [

@@ -129,7 +129,7 @@ class Ray:
         Where all log-moduli are held, a frozen posterior is a parabola of the others: one step leads to its minimum.
         """
         if self.held.all() and isinstance(self.fixed, FrozenPosterior):
-            return _at_held_moduli(self.fixed, start)
+            return at_held_moduli(self.fixed, start)
         bounds = self.bounds.fixed(start[: len(self.held)], self.held)
         for _ in range(TRIES):
             found = gauss_newton(self.fixed, start, bounds=bounds, tolerance=ON_RAY)
@@ -190,7 +190,7 @@ def _on_line(points: Sequence[RayPoint], level: float) -> float:
     return far + (level - high) / (rise if rise > 0.1 * high / far else high / far)
 
 
-def _at_held_moduli(posterior: FrozenPosterior, start: NDArray[np.float64]) -> Minimum:
+def at_held_moduli(posterior: FrozenPosterior, start: NDArray[np.float64]) -> Minimum:
     """The minimum over all but the log-moduli of unknowns (n,), with the evaluation at `start` but for the value."""
     there, n = posterior(start), posterior.n_parameters
     step = newton_step(there, np.arange(len(start)) >= n, n)
