@@ -32,7 +32,7 @@ FLOOR = 1e-4  # of ln E: a move that is always short enough
 LAST_FIT = 0.3  # standard deviations that the mean moved: so near, the noise is fitted for the last time
 PATIENCE = 3  # iterations after which it is where a step was no longer than one: a search may go to and fro by more
 CALM = 0.8  # of ln of what residuals weigh: a change with which the noise still follows the search
-FREE = 2  # first iterations, of homogeneous tissues, in which the frame may move or not
+FREE = 2, 4  # first iterations, at least and at most, of homogeneous tissues, in which the frame may move or not
 FAR_MOST, OF_RIVALS = 4, 2  # explanations that are compared on the way; those of each other group
 RIVAL = 3.0  # of the log-evidence: groups less likely by so much, as the likeliest one sees them, are left out
 FOLLOWED = 4  # iterations in which a rival is followed
@@ -190,7 +190,7 @@ def _rivals(now: Searched, bounds: Bounds) -> list[Searched]:
         if of.level > now.posterior.level - RIVAL and of.group not in found:
             own = Mixture(tuple(other for other in seen.explanations if other.group == of.group))
             objective = now.objective.believing(of.prior(now.objective.parameters))
-            before = replace(now, objective=objective, mixture=own, group=of.group, moved=0.0)
+            before = replace(now, objective=objective, mixture=own, group=of.group, moved=np.inf)
             found[of.group] = _taken(before, at.evaluation, of.minimum.unknowns)
     return list(found.values())
 
@@ -244,7 +244,8 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
     near_end = now.moved < LAST_FIT or (exact and now.fits >= PATIENCE)
     settled = now.settled or (near_end and _change(now.objective, objective) < CALM)
-    group = mixture.explanations[0].group if now.group is None and now.fits + 1 >= FREE else now.group
+    free = now.fits + 1 < FREE[0 if exact else 1]
+    group = now.group or (None if free else mixture.explanations[0].group)
     before = replace(
         now,
         objective=objective,
