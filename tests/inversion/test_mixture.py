@@ -9,6 +9,7 @@ import pytest
 
 from palpate.inversion import (
     Bounds,
+    Candidates,
     Objective,
     cheapest_posterior,
     mixture_of,
@@ -16,7 +17,7 @@ from palpate.inversion import (
 from palpate.inversion.mixture import SEEN, TRUSTED_SD, LinearEvidence
 from palpate.unknowns.blocks import Choice
 
-EVERY = 10_000  # more explanations than there are
+EVERY = Candidates(most=10_000)  # more explanations than there are
 FRAME, GLAND, SAC = 4, 5, 6  # numbers of the first image's blocks
 AWAY = np.array([0.2, 0.1])
 
@@ -35,9 +36,9 @@ def place(of, theta=AWAY):
     return np.concatenate([theta, 0.1 * np.cos(np.arange(of.parameters.n_coefficients))])
 
 
-def compared(of, objective, most=EVERY):
+def compared(of, objective, candidates=EVERY):
     x = place(of)
-    return LinearEvidence.of(objective.parameters, objective(x), x).compared(most)
+    return LinearEvidence.of(objective.parameters, objective(x), x).compared(candidates)
 
 
 def mixture_at(objective, unknowns, bounds=None, **named):
@@ -112,7 +113,7 @@ def test_weights_are_those_of_the_exact_evidences(patients, seen):
     """Ln E flat; Laplace's approximation is exact for a linear body."""
     of, objective = seen
     every = dense(patients, of, objective)
-    mixture = mixture_at(objective, place(of), most=EVERY)
+    mixture = mixture_at(objective, place(of), candidates=EVERY)
     found = np.log(mixture.weights)
     expected = np.array([every[tuple(sorted(each.chosen.items()))] for each in mixture.explanations])
     assert len(found) > 2
@@ -195,7 +196,7 @@ def test_choices_that_a_problem_lacks_are_none(patients, dropped):
     of = patients.without(patients.patient(rng), dropped)
     objective = of.objective(rng)
     every = dense(patients, of, objective)
-    mixture = mixture_at(objective, place(of), most=EVERY)
+    mixture = mixture_at(objective, place(of), candidates=EVERY)
     expected = np.array([every[tuple(sorted(each.chosen.items()))] for each in mixture.explanations])
     assert np.log(mixture.weights) - np.log(mixture.weights[0]) == pytest.approx(expected - expected[0], abs=0.01)
 
