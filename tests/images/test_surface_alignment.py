@@ -95,3 +95,15 @@ def test_images_that_show_no_surface_away_from_their_border_are_refused():
     small = body(STILL, field=(14.0, 14.0, 14.0))
     with pytest.raises(InputDataError, match="align = 'none'"):
         aligned(small, small)
+
+
+def test_maps_of_the_earlier_image_that_are_known_from_another_later_one_are_those_made_anew():
+    before, first, second = body(STILL), body(ELSEWHERE, seed=1), body(STILL, filling=3.0, seed=2)
+    known = surface_maps(before, first)
+    again, anew = surface_maps(before, second, known), surface_maps(before, second)
+    assert list(again) == list(anew)
+    for tissue in anew:
+        assert again[tissue][0] is known[tissue][0]
+        for one, other in zip(again[tissue], anew[tissue], strict=True):
+            np.testing.assert_array_equal(one.map.coefficients, other.map.coefficients)
+            np.testing.assert_array_equal(one.points.places, other.points.places)

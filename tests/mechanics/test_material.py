@@ -254,7 +254,7 @@ def test_responses_to_the_material_are_made_anew_far_away_without_another_factor
     first = reduced_basis(model, MODULI)
     values = model.solve(MODULI, np.concatenate([coefficients[0], 0.0 * coefficients[1]])).values
     first = first.with_material(first.system.material_responses(values), MODULI, values)
-    moduli, n, column = MODULI * [2.0, 1.0], model.n_regions + len(every), model.n_regions + body[1].n_modes
+    moduli, n, column = MODULI * [3.0, 1.0], model.n_regions + len(every), model.n_regions + body[1].n_modes
     basis = first.update(LinearisationPoint(moduli, every, rng.normal(size=(n, 2)), np.eye(n)))
     homogeneous = np.concatenate([coefficients[0], 0.0 * coefficients[1]])
     exact, found = (of.solve(moduli, homogeneous).tangent()[:, column:] for of in (model, basis.model))

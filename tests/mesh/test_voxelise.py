@@ -8,7 +8,7 @@ from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import FACES, OUTER, TetMesh
-from palpate.mesh.voxelise import BRICK, voxelise
+from palpate.mesh.voxelise import BRICKS, DeformedFaces, voxelise
 
 TISSUES = (
     Tissue("ball", Role.ESTIMATE, (1,)),
@@ -130,8 +130,16 @@ def test_a_voxel_has_the_same_tissue_in_whatever_brick_it_lies_in_holes_and_outs
         return VoxelGrid(shape, affine)
 
     slabs = [(slice(k, k + 1), slice(None), slice(None)) for k in (13, 21)]
-    for of in [tuple(slice(BRICK - k, None) for k in order) for order in ((1, 2, 3), (3, 1, 2), (2, 3, 1))] + slabs:
+    starts = [(size - a, size - b, size - c) for size in BRICKS for a, b, c in ((1, 2, 3), (3, 1, 2), (2, 3, 1))]
+    for of in [tuple(slice(k, None) for k in start) for start in starts] + slabs:
         assert np.array_equal(voxelise(space, wave(space.points), part(*of)), bricks[of])
+
+
+def test_faces_that_are_laid_over_several_grids_give_what_each_gives_alone():
+    space = lagrange_space(ball_and_cavity(), "P2")
+    faces = DeformedFaces.of(space, wave(space.points))
+    for own in (grid(), grid(shape=(17, 17, 17), spacing=1.0, origin=(-8, -8, -8))):
+        assert np.array_equal(faces.on(own), voxelise(space, wave(space.points), own))
 
 
 def test_any_orientation_of_the_voxel_axes_gives_the_same_tissues():

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from palpate.errors import ConfigurationError
-from palpate.inversion import Bounds, fixed_correspondence, frozen_posterior, gauss_newton
+from palpate.inversion import Bounds, fixed_correspondence, frozen_posterior, gauss_newton, pulls_of
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.first_order import expanded
 from palpate.mechanics.laws.registry import law_named
 from palpate.observation.noise_model import NoiseModel
+from palpate.uncertainty.profile import at_held_moduli
 
 WIDE = Bounds(np.full(2, np.log(0.02)), np.full(2, np.log(200.0)))
 NOISE = NoiseModel(np.array([0.05**2]), np.array([3.0]))
@@ -55,6 +56,29 @@ def test_score_and_matrix_of_the_frozen_posterior_are_those_of_all_residuals_far
     fixed = fixed_correspondence(objective, minimum, evaluation)(away)
     assert frozen.score == pytest.approx(fixed.score, rel=1e-8, abs=1e-8 * np.abs(fixed.score).max())
     assert frozen.matrix.dense == pytest.approx(fixed.matrix.dense, rel=1e-8, abs=1e-8 * fixed.matrix.diagonal.max())
+
+
+def test_changed_residuals_pull_as_if_the_posterior_were_frozen_with_them(objective, minimum, rng):
+    evaluation, away = objective(minimum), minimum + 0.2 * rng.standard_normal(len(minimum))
+    frozen = frozen_posterior(objective, minimum, evaluation)
+    changes = [[0.1 * rng.standard_normal(len(of.weights)) for of in evaluation.linearisations] for _ in range(2)]
+    for pulls, errors in zip(pulls_of(objective, minimum, evaluation, changes), changes, strict=True):
+        terms = zip(evaluation.linearisations, errors, strict=True)
+        other = replace(evaluation, linearisations=tuple(of.with_errors(0.5 * error) for of, error in terms))
+        expected, found = frozen_posterior(objective, minimum, other)(away), frozen.pulled(pulls, 0.5)(away)
+        assert found.score == pytest.approx(expected.score, rel=1e-8, abs=1e-8 * np.abs(expected.score).max())
+        assert np.array_equal(found.matrix.dense, frozen(away).matrix.dense)
+
+
+def test_at_held_moduli_one_step_leads_to_the_minimum_of_all_else(objective, minimum):
+    frozen = frozen_posterior(objective, minimum)
+    start = minimum + np.concatenate([[0.4, -0.3], np.full(len(minimum) - 2, 0.1)])
+    held = Bounds(start[:2], start[:2])
+    expected = gauss_newton(frozen, start, bounds=held, tolerance=1e-12)
+    found = at_held_moduli(frozen, start)
+    assert found.converged
+    assert found.unknowns == pytest.approx(expected.unknowns, abs=1e-6)
+    assert found.evaluation.value == pytest.approx(expected.evaluation.value, rel=1e-8)
 
 
 def test_a_full_model_is_refused(objective, minimum, twin):

@@ -25,7 +25,7 @@ FAR = 30.0  # largest over smallest ratio of moduli to the factorised ones, beyo
 FAR_ALONE = 300.0  # the same for a single right-hand side, which takes some 4 sqrt(spread) iterations
 SNAPSHOT = 1e-5  # relative residual of basis vectors; their error is measured, and corrected, at each place
 DISPLACEMENT, TANGENT = 3e-4, 1e-2  # of the reduced model's error, that a correction may leave
-STALE = 0.3  # change of ln E after which all responses to the material modes are made anew
+STALE = 1.0  # change of ln E after which all responses to the material modes are made anew
 ITERATIONS = 3.0, 5.0  # of conjugate gradients: at least, and for each unit of sqrt(spread) - 1 of moduli's ratios
 MAKING = 2.5e-5  # seconds an unknown that a factorisation takes beside elimination: its matrix, and its probes
 FAR_OFF = 3e-3  # missing share of the displacement, below which derivatives are wrong by as small a share
@@ -224,7 +224,7 @@ class _Missing:
     @property
     def number(self) -> int:
         """How many right-hand sides it takes."""
-        return self.new + self.along.shape[1]
+        return self.new + int(self.along.shape[1])
 
     @property
     def tolerances(self) -> list[float]:
@@ -261,7 +261,7 @@ class _Missing:
         boundary = self.along[: n + model.constraint.n_modes].copy()
         boundary[n:] = 0.0  # what boundary modes do does not depend on the displacement
         loads = model.boundary_loads(self.at.moduli, self._whole(late[:, 0]), boundary)
-        return loads + self._material_loads(late[:, 0])
+        return np.asarray(loads + self._material_loads(late[:, 0]))
 
     def _whole(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
         """A displacement (n_dof,) mm of homogeneous tissues with what follows from the material at the place."""
@@ -271,7 +271,7 @@ class _Missing:
         model = self.basis.full_model
         forces = model.material_forces(self.at.moduli, displacement, material)
         within = self._within(-np.asarray(model.constraint.free.T @ forces))
-        return displacement + np.asarray(model.constraint.free @ within)[:, 0]
+        return np.asarray(displacement + np.asarray(model.constraint.free @ within)[:, 0])
 
     def _material_loads(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
         """Loads (n_free, k), mN, of derivatives by the material modes, and of these by ln E, at u (n_dof,) mm."""

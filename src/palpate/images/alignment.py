@@ -229,14 +229,11 @@ def align(before: Segmentation, after: Segmentation) -> Alignment:
 
 
 def distance_pairs(
-    before: Segmentation, after: Segmentation, tissues: Sequence[int], *, smoothing_mm: float, far: bool = True
+    before: Segmentation, after: Segmentation, tissues: Sequence[int], *, smoothing_mm: float
 ) -> dict[int, tuple[DistanceMap, DistanceMap]]:
-    """Distance maps of tissues (indices) in both images, each smoothed by so much; raises as `tissue_distance_map`.
-
-    Without `far` the maps of `before` are those near its surfaces.
-    """
-    images = product(tissues, ((before, far), (after, True)))
-    maps = mapped(lambda of: tissue_distance_map(of[1][0], of[0], smoothing_mm=smoothing_mm, far=of[1][1]), images)
+    """Distance maps of tissues (indices) in both images, each smoothed by so much; raises as `tissue_distance_map`."""
+    images = product(tissues, (before, after))
+    maps = mapped(lambda of: tissue_distance_map(of[1], of[0], smoothing_mm=smoothing_mm), images)
     return dict(zip(tissues, zip(maps[::2], maps[1::2], strict=True), strict=True))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,3 +244,20 @@ def cropped(grid: VoxelGrid, window: tuple[slice, slice, slice]) -> VoxelGrid:
     affine[:3, 3] = grid.world(np.array([[s.start for s in window]], dtype=float))[0]
     i, j, k = (s.stop - s.start for s in window)
     return VoxelGrid((i, j, k), affine)
+
+
+@dataclass(frozen=True, slots=True)
+class NearMaps:
+    """The distance maps near a segmentation's surfaces, each made once; they end some way from them."""
+
+    image: Segmentation
+    _made: dict[tuple[int, float, float], DistanceMap] = field(default_factory=dict, repr=False)
+
+    def of(self, tissue: int, *, smoothing_mm: float, reach_mm: float) -> DistanceMap:
+        """That of a tissue by its index; raises as `tissue_distance_map`."""
+        key = tissue, smoothing_mm, reach_mm
+        if key not in self._made:
+            self._made[key] = tissue_distance_map(
+                self.image, tissue, smoothing_mm=smoothing_mm, reach_mm=reach_mm, far=False
+            )
+        return self._made[key]

@@ -16,14 +16,14 @@ from palpate.images.alignment import (
     TUKEY,
     RigidFit,
     RigidMotion,
-    distance_pairs,
     seen_surface,
     tukey,
     within_border,
 )
-from palpate.images.distance import DistanceMap, smoothing_width
+from palpate.images.distance import DistanceMap, IsosurfacePoints, smoothing_width, tissue_distance_map
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
+from palpate.parallel import mapped
 
 SMOOTHER = 2.0  # times the usual smoothing: it takes the stairs of the voxels, and does the same to both images
 MOST_POINTS = 400  # points of one surface; those between them add no information
@@ -44,7 +44,21 @@ NEGLIGIBLE = 1e-6  # of the largest variance of a smooth motion: moves the resul
 MOST_STEPS = 40
 STEP_TOLERANCE_MM = 1e-3
 
-SurfaceMaps = Mapping[int, tuple[DistanceMap, DistanceMap]]  # by a tissue's index: in the first image and in the later
+
+@dataclass(frozen=True, slots=True)
+class MappedSurface:
+    """The distance map of a tissue in one image, and the points of its surface away from the image's border."""
+
+    map: DistanceMap
+    points: IsosurfacePoints
+
+    @classmethod
+    def of(cls, distance: DistanceMap) -> MappedSurface:
+        """That of a distance map."""
+        return cls(distance, seen_surface(distance))
+
+
+SurfaceMaps = Mapping[int, tuple[MappedSurface, MappedSurface]]  # by a tissue's index: in the first image and the later
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,12 +112,25 @@ def shown_tissues(segmentation: Segmentation) -> tuple[int, ...]:
     return tuple(i for i in range(len(tissues)) if i not in filler)
 
 
-def surface_maps(before: Segmentation, after: Segmentation) -> SurfaceMaps:
-    """Distance maps in both images of every tissue (by its index) with a surface of its own that both have."""
-    present = [set(np.unique(image.index).tolist()) for image in (before, after)]
-    tissues = [i for i in shown_tissues(before) if i in present[0] & present[1]]
+def surface_maps(before: Segmentation, after: Segmentation, known: SurfaceMaps | None = None) -> SurfaceMaps:
+    """Distance maps in both images of every tissue (by its index) with a surface of its own that both have.
+
+    known: those of the same earlier image and another later one, whose maps of the former are not made again.
+    """
+    tissues = [i for i in shown_tissues(before) if before.mask(i).any() and after.mask(i).any()]
     width = SMOOTHER * smoothing_width(before.grid, after.grid)
-    return distance_pairs(before, after, tissues, smoothing_mm=width, far=False)
+    there = {i: first for i, (first, _) in (known or {}).items() if first.map.smoothing_mm == width}
+
+    def mapped_surface(of: tuple[int, bool]) -> MappedSurface:
+        """The surface of a tissue in the later image, or in the earlier one."""
+        tissue, later = of
+        if not later and tissue in there:
+            return there[tissue]
+        image = after if later else before
+        return MappedSurface.of(tissue_distance_map(image, tissue, smoothing_mm=width, far=later))
+
+    found = mapped(mapped_surface, [(i, later) for i in tissues for later in (False, True)])
+    return dict(zip(tissues, zip(found[::2], found[1::2], strict=True), strict=True))
 
 
 def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
@@ -117,14 +144,14 @@ def align_surfaces(before: Segmentation, maps: SurfaceMaps) -> RigidFit:
     """
     surfaces, middles = list[_Shown](), list[tuple[NDArray[np.float64], NDArray[np.float64]]]()  # (3,) mm in both
     for tissue, pair in maps.items():
-        first, second = (seen_surface(one) for one in pair)
+        first, second = (one.points for one in pair)
         if min(len(first.area), len(second.area)) < LEAST_POINTS:
             continue
         step = -(-len(first.area) // MOST_POINTS)
         places, normals = first.places[::step], first.normals[::step]
         alike = np.exp(-0.5 * cdist(places, places, "sqeuclidean") / LENGTH_MM**2) * (normals @ normals.T)
         own = OWN_MOTION_MM[before.tissues[tissue].role] * _factor(alike)
-        surfaces.append(_Shown(places, pair[0].at(places), pair[1], own))
+        surfaces.append(_Shown(places, pair[0].map.at(places), pair[1].map, own))
         middles.append((first.area @ first.places / first.area.sum(), second.area @ second.places / second.area.sum()))
     if not surfaces:
         raise InputDataError(
@@ -159,10 +186,10 @@ def residuals_by_tissue(before: Segmentation, maps: SurfaceMaps, motion: RigidMo
     """How far each tissue's surface lies from the later image's once it has moved so, mm: root mean square."""
     found = {}
     for tissue, (first, second) in maps.items():
-        places = seen_surface(first).places
-        places = places[within_border(second.grid, motion.apply(places))]
+        places = first.points.places
+        places = places[within_border(second.map.grid, motion.apply(places))]
         if len(places) >= LEAST_POINTS:
-            distance = second.at(motion.apply(places)) - first.at(places)
+            distance = second.map.at(motion.apply(places)) - first.map.at(places)
             found[before.tissues[tissue].name] = float(np.sqrt(np.mean(distance**2)))
     return found
 

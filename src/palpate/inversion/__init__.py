@@ -11,6 +11,7 @@ from palpate.inversion.frozen_posterior import Posterior as Posterior
 from palpate.inversion.frozen_posterior import cheapest_posterior as cheapest_posterior
 from palpate.inversion.frozen_posterior import fixed_correspondence as fixed_correspondence
 from palpate.inversion.frozen_posterior import frozen_posterior as frozen_posterior
+from palpate.inversion.frozen_posterior import pulls_of as pulls_of
 from palpate.inversion.hyper_parameters import with_correlations as with_correlations
 from palpate.inversion.hyper_parameters import with_first_noise as with_first_noise
 from palpate.inversion.hyper_parameters import with_scales as with_scales
@@ -30,6 +31,7 @@ from palpate.inversion.optimise import LeastSquares as LeastSquares
 from palpate.inversion.optimise import Minimum as Minimum
 from palpate.inversion.optimise import Outcome as Outcome
 from palpate.inversion.optimise import gauss_newton as gauss_newton
+from palpate.inversion.optimise import newton_step as newton_step
 from palpate.inversion.optimise import posterior_sd as posterior_sd
 from palpate.inversion.scenarios import Alternatives as Alternatives
 from palpate.inversion.scenarios import alternatives_of as alternatives_of

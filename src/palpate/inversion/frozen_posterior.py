@@ -6,12 +6,13 @@ reduced model it is a quadratic form in the model's amplitudes: an evaluation fo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
@@ -20,8 +21,11 @@ from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.reduced import ReducedModel, common_vectors
+from palpate.mechanics.solvers.cholesky import forward, lower_factor
+from palpate.observation.jacobian import Jacobian
 from palpate.unknowns.parameters import ParameterMap
 
+ROUNDING = 1e-13  # of the largest number on the diagonal of a form that has no inverse
 ONE = np.ones(1)  # the coordinate of what no unknown moves
 
 
@@ -110,15 +114,44 @@ class FrozenState:
 
     Offsets of the residuals, and modes of surfaces at rest, stand before the 1. expanded (n_regions,) kPa: E_0 where an
     expansion adds to the model, z = [a, q, ln E - ln E_0, 1]; form: Q (k, k), the residuals' part of the objective is
-    1/2 z^T Q z; square: S (k, k), their mean square is z^T S z, mm^2; common: how many first basis vectors are those of
-    the first state.
+    1/2 z^T Q z; square: S (k, k), their mean square is z^T S z, mm^2; root, beside, left: upper R_a (m, m), R_l^T and
+    Q_l of the others z_l, with which it is 1/2 |R_a a + R_l z_l|^2 + 1/2 z_l^T Q_l z_l but for what is linear in z;
+    common: how many first basis vectors are those of the first state.
     """
 
     reduced: ReducedModel
     expanded: NDArray[np.float64] | None
     form: NDArray[np.float64]
     square: NDArray[np.float64]
+    root: NDArray[np.float64]
+    beside: NDArray[np.float64]
+    left: NDArray[np.float64]
     common: int = 0
+
+    @classmethod
+    def of(
+        cls,
+        reduced: ReducedModel,
+        expanded: NDArray[np.float64] | None,
+        form: NDArray[np.float64],
+        square: NDArray[np.float64],
+        common: int,
+    ) -> FrozenState:
+        """That of a form, with its root: Q_aa = R_a^T R_a by Cholesky, up to rounding, and R_a^T R_l = Q_al."""
+        m = reduced.n_basis
+        own, across = form[:m, :m].copy(), form[:m, m:-1]
+        own[np.diag_indices(m)] += ROUNDING * float(np.diag(own).max(initial=0.0)) + np.finfo(np.float64).tiny
+        factor = lower_factor(own)
+        beside = np.ascontiguousarray(forward(factor, across).T)
+        left = form[m:-1, m:-1] - beside @ beside.T
+        return cls(reduced, expanded, form, square, np.asfortranarray(factor.T), beside, left, common)
+
+    def pulled(self, pull: NDArray[np.float64]) -> FrozenState:
+        """The same with a form that is z^T y larger, y = `pull` (k - 1,) by all coordinates but the last."""
+        form = self.form.copy()
+        form[:-1, -1] += pull
+        form[-1, :-1] += pull
+        return replace(self, form=form)
 
     def coordinates(
         self,
@@ -149,14 +182,12 @@ class FrozenState:
     ) -> NDArray[np.float64]:
         """D^T Q D (n_own, n_own), of the same derivatives D = [A; B], B of all coordinates but the amplitudes.
 
-        It is B^T Q_bb B + W + W^T with W = A^T (Q_aa A / 2 + Q_ab B), and B is of zeros and ones but for ln E.
+        It is Z^T Z + B^T Q_l B with Z = R_a A + R_l B, R_a triangular, and B is of zeros and ones but for ln E.
         """
-        m, n = amplitude_slopes.shape
-        across = self._by_others(self.form[m:-1, :m], modulus_slopes)
-        across[:n] += (0.5 * amplitude_slopes.T) @ self.form[:m, :m]
-        found, half = self._of_others(self.form[m:-1, m:-1], modulus_slopes), across @ amplitude_slopes
-        found[:, :n] += half
-        found[:n] += half.T
+        half = self._by_others(self.beside, modulus_slopes)
+        half[: amplitude_slopes.shape[1]] += linalg.blas.dtrmm(1.0, self.root, amplitude_slopes).T
+        found = self._of_others(self.left, modulus_slopes)
+        found += half @ half.T
         return found
 
     def _of_others(self, values: NDArray[np.float64], modulus_slopes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -217,6 +248,15 @@ class FrozenPosterior:
         """The same under another prior of its unknowns."""
         return replace(self, parameters=parameters)
 
+    def pulled(self, pulls: Sequence[NDArray[np.float64]], amount: float) -> FrozenPosterior:
+        """The same with residuals that pull by `amount` times y (k - 1,) of each state more (see `pulls_of`)."""
+        pairs = zip(self.states, pulls, strict=True)
+        return replace(self, states=tuple(state.pulled(amount * pull) for state, pull in pairs))
+
+    def alone(self, number: int) -> FrozenPosterior:
+        """That of one state, of the unknowns of `ParameterMap.alone`."""
+        return FrozenPosterior(self.parameters.alone(number)[0], (replace(self.states[number], common=0),))
+
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """Its value, score and Gauss-Newton matrix at unknowns (n,), without residuals; raises `SolverError`.
 
@@ -239,18 +279,19 @@ class FrozenPosterior:
         return Evaluation(value, misfit, score, prior.plus(blocks), (), prior, pull, believed)
 
 
-def frozen_posterior(
-    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None
-) -> FrozenPosterior:
-    """The posterior with the closest points and weights at `unknowns` (n,), under the objective's own prior of them.
+@dataclass(frozen=True, slots=True)
+class _SeenState:
+    """A state to be frozen: `bare` of forms, its z (k,) there, and of each observation a term and its S dr/dz."""
 
-    Residuals are point-to-plane, r + n.(u - u_0), as in the Gauss-Newton matrix. evaluation: that of the objective
-    there, where it is known. Raises `ConfigurationError` for models that are neither reduced ones nor bent by one.
-    """
-    evaluation = evaluation or objective(unknowns)
+    bare: FrozenState
+    z: NDArray[np.float64]
+    terms: tuple[tuple[Linearisation, Jacobian], ...]
+
+
+def _seen_states(objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation) -> Iterator[_SeenState]:
+    """What is frozen of one state after the other at unknowns (n,); raises as `frozen_posterior`."""
     parameters = objective.parameters
     moduli, coefficients = parameters.moduli(unknowns), parameters.coefficients(unknowns)
-    states = list[FrozenState]()
     for s, model in enumerate(fixed_correspondence(objective, unknowns, evaluation).models):
         reduced = model.like if isinstance(model, CurvedModel) else model
         if not isinstance(reduced, ReducedModel):
@@ -271,9 +312,9 @@ def frozen_posterior(
         offsets = parameters.offsets(unknowns, s)
         alone = reduced.outputs(lambda values: values[:0])
         alone = replace(alone, coupling=np.ascontiguousarray(alone.coupling))
-        bare = FrozenState(alone, expanded, *(np.zeros((0, 0)),) * 2)
+        bare = FrozenState(alone, expanded, *(np.zeros((0, 0)),) * 5)
         z = bare.coordinates(bare.reduced.solve(moduli, coefficients[s]).amplitude, moduli, coefficients[s], offsets)
-        form, square = np.zeros((len(z), len(z))), np.zeros((len(z), len(z)))
+        terms = list[tuple[Linearisation, Jacobian]]()
         for rows, term in zip(objective.states[s].slices, linearisations, strict=True):
             of_offsets = term.jacobian.tangent[:, term.jacobian.shape[1] - len(offsets) :]
             below = np.zeros((len(of_offsets) - len(answer[rows]), answer.shape[1]))
@@ -282,15 +323,56 @@ def frozen_posterior(
                 below[1 : 1 + n_regions, -n_regions:] = np.eye(n_regions)
                 below[1 + n_regions :, first : first + len(below) - 1 - n_regions] = np.eye(len(below) - 1 - n_regions)
             moved = np.concatenate([np.concatenate([answer[rows], below]), of_offsets], axis=1)
-            by_z = replace(term.jacobian, tangent=moved)
-            rest = term.residuals.values - by_z.times(z[:-1])
+            terms.append((term, replace(term.jacobian, tangent=moved)))
+        yield _SeenState(bare, z, tuple(terms))
+
+
+def frozen_posterior(
+    objective: Objective, unknowns: NDArray[np.float64], evaluation: Evaluation | None = None
+) -> FrozenPosterior:
+    """The posterior with the closest points and weights at `unknowns` (n,), under the objective's own prior of them.
+
+    Residuals are point-to-plane, r + n.(u - u_0), as in the Gauss-Newton matrix. evaluation: that of the objective
+    there, where it is known. Raises `ConfigurationError` for models that are neither reduced ones nor bent by one.
+    """
+    evaluation = evaluation or objective(unknowns)
+    states = list[FrozenState]()
+    for seen in _seen_states(objective, unknowns, evaluation):
+        form, square = np.zeros((len(seen.z), len(seen.z))), np.zeros((len(seen.z), len(seen.z)))
+        for term, by_z in seen.terms:
+            rest = term.residuals.values - by_z.times(seen.z[:-1])
             side = by_z.transposed_times(term.weights * rest)[:, None]
             own = np.block([[by_z.gram(term.weights), side], [side.T, float(term.weights @ rest**2)]])
             form += term.precision * own
             square += own / len(evaluation.linearisations)
-        common = common_vectors(states[0].reduced, bare.reduced) if states else 0
-        states.append(replace(bare, form=form, square=square, common=common))
-    return FrozenPosterior(parameters, tuple(states))
+        common = common_vectors(states[0].reduced, seen.bare.reduced) if states else 0
+        states.append(FrozenState.of(seen.bare.reduced, seen.bare.expanded, form, square, common))
+    return FrozenPosterior(objective.parameters, tuple(states))
+
+
+def pulls_of(
+    objective: Objective,
+    unknowns: NDArray[np.float64],
+    evaluation: Evaluation,
+    changes: Sequence[Sequence[NDArray[np.float64]]],
+) -> list[tuple[NDArray[np.float64], ...]]:
+    """How residuals pull that change: of each of several changes e (n,) mm of each observation, y (k - 1,) by state.
+
+    y = sum W S^T e by the coordinates z, so that the objective changes by z^T y but for a constant. Of the posterior
+    that is frozen there; raises as `frozen_posterior`.
+    """
+    found: list[list[NDArray[np.float64]]] = [[] for _ in changes]
+    first = 0
+    for seen in _seen_states(objective, unknowns, evaluation):
+        own = slice(first, first + len(seen.terms))
+        first = own.stop
+        for of_change, change in zip(found, changes, strict=True):
+            pulls = (
+                by_z.transposed_times(term.precision * term.weights * e)
+                for (term, by_z), e in zip(seen.terms, change[own], strict=True)
+            )
+            of_change.append(np.sum(list(pulls), axis=0))
+    return [tuple(of_change) for of_change in found]
 
 
 class Posterior(LeastSquares, Protocol):

@@ -166,7 +166,8 @@ def mixture_of(
     with determined():
         compared = LinearEvidence.of(posterior.parameters, evaluation, unknowns).compared(candidates)
     known = {of.key: (of.minimum.unknowns, of.volume) for of in (earlier.explanations if earlier else ())}
-    jobs = [(of, *known.get((0, tuple(sorted(of.chosen))), (of.unknowns, None))) for of in compared]
+    like = earlier.explanations[0].volume if earlier else None
+    jobs = [(of, *known.get((0, tuple(sorted(of.chosen))), (of.unknowns, like))) for of in compared]
     found = [each for each in mapped(lambda job: _laplace(posterior, bounds, *job), jobs) if each is not None]
     if not found:
         raise EstimationError("the model cannot be solved near any explanation of the images; check images and mesh")

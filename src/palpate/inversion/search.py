@@ -33,7 +33,7 @@ LAST_FIT = 0.3  # standard deviations that the mean moved: so near, the noise is
 PATIENCE = 3  # iterations after which it is where a step was no longer than one: a search may go to and fro by more
 CALM = 0.8  # of ln of what residuals weigh: a change with which the noise still follows the search
 FREE = 2  # first iterations, of homogeneous tissues, in which the frame may move or not
-FAR_MOST, OF_RIVALS = 6, 2  # explanations that are compared on the way; those of each other group
+FAR_MOST, OF_RIVALS = 4, 2  # explanations that are compared on the way; those of each other group
 RIVAL = 3.0  # of the log-evidence: groups less likely by so much, as the likeliest one sees them, are left out
 FOLLOWED = 4  # iterations in which a rival is followed
 CHANGES = 2  # of the likeliest group, after which the search ends
@@ -275,13 +275,15 @@ def _fitted(now: Searched, near: Bounds, *, fits: bool) -> tuple[Objective, Eval
     Both by the minimum on residuals that are linear around where the search is, under the present explanation.
     """
     at, objective = now.minimum, now.objective
-    number = FITS if now.moved < 1.0 else FAR_FITS
-    for _ in range(number if fits else 1):
+    number, start = FITS if now.moved < 1.0 else FAR_FITS, at.unknowns
+    for fit in range(number if fits else 1):
         linear = LinearisedObjective(objective, at.unknowns, at.evaluation)
-        found = gauss_newton(linear, at.unknowns, bounds=near, tolerance=NEAR)
+        found = gauss_newton(linear, start, bounds=near, tolerance=NEAR)
         if not fits:
             break
-        before, objective = objective, with_scales(with_correlations(objective, found.evaluation), found.evaluation)
+        before, start = objective, found.unknowns
+        objective = objective if fit else with_correlations(objective, found.evaluation)
+        objective = with_scales(objective, found.evaluation)
         if _change(before, objective) < STAYS:
             break
     if fits:

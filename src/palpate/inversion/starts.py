@@ -17,7 +17,7 @@ from scipy import linalg
 
 from palpate.approximation.reduced_basis import SNAPSHOT, ReducedBasis
 from palpate.inversion.frozen_posterior import Posterior
-from palpate.inversion.hyper_parameters import with_first_noise
+from palpate.inversion.hyper_parameters import with_correlations, with_first_noise, with_scales
 from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.objective import LinearisedObjective, Objective
 from palpate.inversion.optimise import Bounds, Minimum, Outcome, gauss_newton, grouped
@@ -31,7 +31,7 @@ from palpate.progress import Progress
 from palpate.unknowns.blocks import FIELD, Acts, Block, Choice
 
 SCREENED = 0.01  # decrement at which the minimum of a start ends
-LEFT_OUT, LEFT_OUT_OF_MAP = 1.0, 0.3  # variances of the first noise that what is left out may explain; of a map
+LEFT_OUT, LEFT_OUT_OF_MAP = 0.5, 0.2  # variances of the noise that what is left out may explain; of a map
 APART = 1.0  # of ln E: from the middle of the bounds to where responses to all modes are made once more
 FITS, FIT = 4, 0.02  # of the coefficients; share of one posterior variance that a coefficient may still move
 
@@ -70,7 +70,7 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
     x of a block with the widest covariance C = L L^T is seen along the eigenvectors of L^T A L, A = J^T W J its
     information: an eigenvalue l is the variance that x may explain along one over that of the noise, and what is left
     out widens the posterior by a share of less than its sum (Spantini et al. 2015, SIAM J. Sci. Comput. 37, A2451,
-    Theorem 2.3; Cui et al. 2014, Inverse Problems 30, 114015). Noise is that before residuals are seen, which is small.
+    Theorem 2.3; Cui et al. 2014, Inverse Problems 30, 114015). Noise is what the residuals show at these moduli.
     """
     parameters, states, found = problem.parameters, list[LaterState](), list[_Responses]()
     begin = np.concatenate([theta, np.zeros(parameters.n_coefficients)])
@@ -91,11 +91,13 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
     for s, (state, q) in enumerate(zip(objective.states, parameters.coefficients(fitted.unknowns), strict=True)):
         found[s] = found[s].with_material(q)
         states[s] = replace(state, observed=found[s].seen(state, q))
+    shown = with_scales(with_correlations(objective, fitted.evaluation), fitted.evaluation)
+    states = [replace(of, observed=own.observed) for of, own in zip(shown.states, states, strict=True)]
     evaluation = replace(objective, states=tuple(states))(fitted.unknowns)
     data, columns = evaluation.matrix - evaluation.prior, [parameters.columns(i) for i in range(len(parameters.blocks))]
     middle, evaluations = fitted.unknowns, fitted.evaluations + 1
     # free the large derivatives of everything observed by all unknowns
-    del objective, states, state, fitted, evaluation
+    del objective, shown, states, state, fitted, evaluation
     informations = [data.block(own, own) for own in columns]
     bases = _combinations(parameters.blocks, informations, [state.model for state in start.states])
     fit = [inverse @ middle[own] for own, (_, inverse) in zip(columns, bases, strict=True)]

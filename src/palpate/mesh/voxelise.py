@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ Warp = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 LATTICE = 2.0**16  # corners are rounded to voxel / LATTICE: products of their differences are then exact in float64
 TIE = 2.0**-14  # voxels: a face that is so near to a voxel's centre counts as just below it
-BRICK = 4  # voxels along each edge of a brick that is decided at once
+BRICKS = (8, 4)  # voxels along each edge of a brick that is decided at once
 BASE = 4  # region r is the digit r in this base, so that sums of unrelated crossings match no region
 
 
@@ -48,56 +49,84 @@ def voxelise(
     voxels in two regions take their nearest neighbour's) or the numbers of points differ. Method: scan conversion with
     a symbolic perturbation at ties.
     """
-    if displacement.shape != space.points.shape:
-        raise GeometryError(
-            f"the displacement has the shape {displacement.shape}, the space {space.points.shape}: give one row for"
-            " each point"
-        )
-    faces = []  # between regions, each once, normals out of `inner` (n,) into `other` (n,)
-    for region in np.unique(space.mesh.region):
-        surface = tissue_surface(space.mesh, int(region))
-        first = (surface.other > region) | ~np.isin(surface.other, space.mesh.region)
-        faces.append((surface.triangles[first], np.full(int(first.sum()), region), surface.other[first]))
-    triangles, inner, other = (np.concatenate(parts) for parts in zip(*faces, strict=True))
-    pieces = _pieces(space, displacement, triangles, subdivisions=subdivisions, warp=warp)
-    count = 4**subdivisions
-    code_inner, code_other = (
-        np.repeat(np.where(np.isin(side, space.mesh.region), BASE ** np.maximum(side, 0), 0), count)
-        for side in (inner, other)
-    )
-    tissue = _regions(_accumulate(pieces, code_other - code_inner, grid), space.mesh, crossing)
-    hollow = code_other == 0
-    behind = np.repeat(np.where(other == OUTER, inner, other), count)
-    empty = np.argwhere(tissue < 0)
-    if len(empty):
-        tissue[tuple(empty.T)] = _behind(empty, grid, pieces[hollow].mean(axis=1), behind[hollow])
-    return tissue
+    return DeformedFaces.of(space, displacement, subdivisions=subdivisions, warp=warp).on(grid, crossing=crossing)
 
 
-def _behind(
-    voxels: NDArray[np.int64], grid: VoxelGrid, centres: NDArray[np.float64], regions: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Of each voxel (m, 3) the region of the nearest face; the faces' `centres` (n, 3) mm and `regions` (n,).
+@dataclass(frozen=True, slots=True)
+class DeformedFaces:
+    """The deformed faces between regions, in plane pieces, which several grids may be laid over (see `voxelise`).
 
-    Bricks of voxels are decided first. A region that is nearer to the brick's middle than all others, by more than the
-    brick's diameter, is nearest for all of its voxels.
+    pieces (n, 3, 3) mm: their corners; step (n,): change of the code of what lies beyond them. Where that is no meshed
+    region, behind (n_regions,): the regions that may lie there; nearest: of each, the middles of its pieces.
     """
-    shape = tuple(-(-n // BRICK) for n in grid.shape)
-    brick = np.ravel_multi_index((voxels // BRICK).T, shape)
-    asked = np.flatnonzero(np.bincount(brick, minlength=math.prod(shape)))
-    middle = np.stack(np.unravel_index(asked, shape), axis=1).astype(float) * BRICK + 0.5 * (BRICK - 1)
-    names = np.unique(regions)
-    apart = np.full((len(names) + 1, len(asked)), np.inf)  # the last: where there is no other region
-    for number, name in enumerate(names):
-        apart[number] = KDTree(centres[regions == name]).query(grid.world(middle), workers=-1)[0]
-    first, second = np.partition(apart, 1, axis=0)[:2]
-    half = (BRICK - 1) * np.array(list(itertools.product((-0.5, 0.5), repeat=3))) @ grid.affine[:3, :3].T
-    place = np.searchsorted(asked, brick)
-    found = names[apart.argmin(axis=0)][place]
-    open_ = ~(second - first > 2.0 * np.linalg.norm(half, axis=1).max())[place]
-    nearest = KDTree(centres).query(grid.world(voxels[open_].astype(float)), workers=-1)[1]
-    found[open_] = regions[nearest]
-    return np.asarray(found)
+
+    mesh: TetMesh
+    pieces: NDArray[np.float64]
+    step: NDArray[np.int64]
+    behind: NDArray[np.int64]
+    nearest: tuple[KDTree, ...]
+
+    @classmethod
+    def of(
+        cls,
+        space: LagrangeSpace,
+        displacement: NDArray[np.float64],
+        *,
+        subdivisions: int = 2,
+        warp: Warp | None = None,
+    ) -> DeformedFaces:
+        """Those of a displacement (n_points, 3) mm of a space; raises `GeometryError` for other numbers of points."""
+        if displacement.shape != space.points.shape:
+            raise GeometryError(
+                f"the displacement has the shape {displacement.shape}, the space {space.points.shape}: give one row"
+                " for each point"
+            )
+        faces = []  # between regions, each once, normals out of `inner` (n,) into `other` (n,)
+        for region in np.unique(space.mesh.region):
+            surface = tissue_surface(space.mesh, int(region))
+            first = (surface.other > region) | ~np.isin(surface.other, space.mesh.region)
+            faces.append((surface.triangles[first], np.full(int(first.sum()), region), surface.other[first]))
+        triangles, inner, other = (np.concatenate(parts) for parts in zip(*faces, strict=True))
+        pieces = _pieces(space, displacement, triangles, subdivisions=subdivisions, warp=warp)
+        count = 4**subdivisions
+        code_inner, code_other = (
+            np.repeat(np.where(np.isin(side, space.mesh.region), BASE ** np.maximum(side, 0), 0), count)
+            for side in (inner, other)
+        )
+        hollow = code_other == 0
+        behind, centres = np.repeat(np.where(other == OUTER, inner, other), count)[hollow], pieces[hollow].mean(axis=1)
+        trees = tuple(KDTree(centres[behind == name]) for name in np.unique(behind))
+        return cls(space.mesh, pieces, code_other - code_inner, np.unique(behind), trees)
+
+    def on(self, grid: VoxelGrid, *, crossing: bool = False) -> NDArray[np.int16]:
+        """Tissue (n_x, n_y, n_z) at each voxel's centre; raises `GeometryError` as `voxelise`."""
+        tissue = _regions(_accumulate(self.pieces, self.step, grid), self.mesh, crossing)
+        empty = np.argwhere(tissue < 0)
+        if len(empty):
+            tissue[tuple(empty.T)] = self._behind(empty, grid)
+        return tissue
+
+    def _behind(self, voxels: NDArray[np.int64], grid: VoxelGrid) -> NDArray[np.int64]:
+        """Of each voxel (m, 3) the region behind the nearest face.
+
+        Bricks of voxels are decided first, large ones before small ones. A region that is nearer to a brick's middle
+        than all others, by more than the brick's diameter, is nearest for all of its voxels.
+        """
+        found = np.zeros(len(voxels), dtype=np.int64)
+        left = np.arange(len(voxels)) if len(self.nearest) > 1 else np.zeros(0, dtype=np.int64)
+        for size in (*BRICKS, 1):
+            shape = tuple(-(-n // size) for n in grid.shape)
+            brick = np.ravel_multi_index((voxels[left] // size).T, shape)
+            asked = np.flatnonzero(np.bincount(brick, minlength=math.prod(shape)))
+            middle = np.stack(np.unravel_index(asked, shape), axis=1).astype(float) * size + 0.5 * (size - 1)
+            apart = np.stack([tree.query(grid.world(middle), workers=-1)[0] for tree in self.nearest])
+            half = (size - 1) * np.array(list(itertools.product((-0.5, 0.5), repeat=3))) @ grid.affine[:3, :3].T
+            place = np.searchsorted(asked, brick)
+            found[left] = apart.argmin(axis=0)[place]
+            first, second = np.partition(apart, 1, axis=0)[:2]
+            decided = second - first > 2.0 * np.linalg.norm(half, axis=1).max()
+            left = left[~decided[place]]
+        return np.asarray(self.behind[found])
 
 
 def _regions(codes: NDArray[np.int64], mesh: TetMesh, crossing: bool) -> NDArray[np.int16]:
@@ -179,13 +208,14 @@ def _columns(
     within = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
     x = low[owner, 0] + within // np.maximum(extent[owner, 1], 1)
     y = low[owner, 1] + within % np.maximum(extent[owner, 1], 1)
-    around, place = corners[faces[owner], :, :2], np.stack([x, y], axis=1).astype(float)
-    inside = np.ones(len(place), dtype=np.bool_)
+    inside, place = np.ones(len(owner), dtype=np.bool_), (x.astype(float), y.astype(float))
+    own = corners[faces]
     for k in range(3):
-        edge = around[:, (k + 1) % 3] - around[:, k]
-        side = _cross(edge, place - around[:, k])
-        tie = (edge[:, 1] < 0) | ((edge[:, 1] == 0) & (edge[:, 0] > 0))  # on an edge, as if moved by (e, e^2)
-        inside &= (side > 0) | ((side == 0) & tie)
+        start, (along_x, along_y) = own[:, k], (own[:, (k + 1) % 3, :2] - own[:, k, :2]).T
+        tie = (along_y < 0) | ((along_y == 0) & (along_x > 0))  # on an edge, as if moved by (e, e^2)
+        to_x, to_y = place[0] - start[owner, 0], place[1] - start[owner, 1]
+        side = along_x[owner] * to_y - along_y[owner] * to_x
+        inside &= (side > 0) | ((side == 0) & tie[owner])
     return faces[owner[inside]], x[inside], y[inside]
 
 

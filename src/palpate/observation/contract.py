@@ -17,6 +17,7 @@ from scipy import sparse
 
 from palpate.findings import Finding
 from palpate.images.alignment import RigidMotion
+from palpate.images.distance import NearMaps
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.noise_model import FitResponse, NoiseModel
@@ -338,7 +339,7 @@ class Imaged(Protocol):
         """The noise of the images' drawing that a case states; None where the residuals are to tell."""
         ...
 
-    def imaging_error(self, residuals: Residuals, before: Segmentation, after: Segmentation) -> NDArray[np.float64]:
+    def imaging_error(self, residuals: Residuals, before: NearMaps, after: NearMaps) -> NDArray[np.float64]:
         """Errors (n,) mm of the residuals when the model itself is imaged: `before` at rest, `after` deformed."""
         ...
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from palpate.errors import EstimationError
 from palpate.images.alignment import within_border
 from palpate.images.checks import later_names
-from palpate.images.distance import DistanceMap, tissue_distance_map
+from palpate.images.distance import DistanceMap, NearMaps, tissue_distance_map
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.surface import vertex_normals
 from palpate.observation.contract import Fit, ImagedBody, Observation, Residuals, Weighting
@@ -178,7 +178,7 @@ class SurfaceDistance:
             [r.values for r in residuals], [r.material for r in residuals], [r.normals for r in residuals], response
         )
 
-    def imaging_error(self, residuals: Residuals, before: Segmentation, after: Segmentation) -> NDArray[np.float64]:
+    def imaging_error(self, residuals: Residuals, before: NearMaps, after: NearMaps) -> NDArray[np.float64]:
         """Errors (n,) mm of the residuals when the fitted model itself is imaged.
 
         Both directions of the distance see the same error and have half the weight each: that of the direction model ->
@@ -193,13 +193,10 @@ class SurfaceDistance:
         corners = surface.triangles[corners]
         rest = np.einsum("qk,qka->qa", barycentric, surface.rest[corners])
         excess = np.einsum("qk,qk->q", barycentric, self.held.excess[corners])
-        maps = [
-            tissue_distance_map(image, surface.tissue, smoothing_mm=width, reach_mm=AROUND * width, far=False)
-            for image in (before, after)
-        ]
+        maps = [images.of(surface.tissue, smoothing_mm=width, reach_mm=AROUND * width) for images in (before, after)]
         errors, n = np.zeros(len(residuals.values)), len(rest)
         places = residuals.places[:n]
-        shown = within_border(before.grid, rest, 1.0) & within_border(after.grid, places, 1.0)
+        shown = within_border(before.image.grid, rest, 1.0) & within_border(after.image.grid, places, 1.0)
         errors[:n] = np.where(shown, 2.0 * (maps[1].at(places) - maps[0].at(rest) - excess), 0.0)
         return errors
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -20,14 +20,21 @@ from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, seen_by
 from palpate.progress import Progress, silent
 from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of, fitted_materials
-from palpate.study.estimate_findings import data_findings, fold_findings, inversion_findings, pair_findings
+from palpate.study.estimate_findings import (
+    data_findings,
+    fold_findings,
+    inversion_findings,
+    pair_findings,
+    variation_findings,
+)
 from palpate.study.estimated import Estimation, ForceFit, Iteration, PointFit, Start, StatedExplanation, TissueFit
 from palpate.study.map_words import map_findings
 from palpate.study.misfit import beside_misfits, misfits_of
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, ratios_of
 from palpate.study.samples import draw_moduli
-from palpate.study.stated_posterior import as_stated
+from palpate.study.stated_posterior import StatedPosterior, as_stated
 from palpate.study.together import combinations_of, image_pairs_of, regions_of
+from palpate.study.variations import Variation
 from palpate.study.verdicts import IDENTIFIED, estimates_of, intervals_of
 from palpate.uncertainty import (
     GRID_DRAWS,
@@ -58,11 +65,12 @@ def conclude(
     truth: Mapping[str, float],
     seed: int,
     samples: int = 0,
+    vary: Callable[[StatedPosterior], tuple[Variation, ...]] = lambda _: (),
     progress: Progress = silent,
 ) -> Estimation:
     """State the result of an inversion; `truth`: true moduli (kPa) by tissue where they are known.
 
-    samples: draws of the moduli's posterior, where the estimate converged; 0: none.
+    samples: draws of the moduli's posterior, where the estimate converged; 0: none; vary: what would change it then.
     The covariance is the sandwich under the residuals' noise model plus the scatter over grid positions.
     """
     objective, minimum = inversion.objective, inversion.minimum
@@ -76,7 +84,7 @@ def conclude(
     posterior = as_stated(inversion, own, settings.bounds)
     covariance = posterior.mixture.covariance
     progress("intervals: profiles, and the fit of every surface before and after")
-    pairs = image_pairs_of(inversion, settings.bounds, errors)
+    pairs = image_pairs_of(inversion, settings.bounds, errors, posterior.frozen)
     known = intervals_of(inversion, settings, posterior)
     fits, forces, points = _seen(inversion, observed)
     misfits = misfits_of(minimum.evaluation.linearisations, points, observed.states[0].space.mesh.tissues)
@@ -96,6 +104,7 @@ def conclude(
     if minimum.converged:  # of each kind of data in what is known of a tissue's modulus
         of_tissues = information_shares(minimum.evaluation, objective.n_parameters)
         shares = dict(zip(objective.parameters.tissues, of_tissues, strict=False))
+    variations = vary(posterior) if minimum.converged else ()
     names = later_names(len(observed.images))
     if all(image is None for image in observed.images):  # the body is given as a mesh
         names = [f"state {number}" for number in range(1, len(observed.images) + 1)]
@@ -107,6 +116,7 @@ def conclude(
         *(misfit.finding for misfit in misfits),
         *discrepancy_findings(found_discrepancy),
         *map_findings(maps),
+        *variation_findings(variations, estimates),
     )
     return Estimation(
         status="converged" if minimum.converged else "not converged",
@@ -134,6 +144,7 @@ def conclude(
         maps=maps,
         explanations=_explanations(inversion) if minimum.converged else (),
         materials=fitted_materials(inversion),
+        variations=variations,
     )
 
 

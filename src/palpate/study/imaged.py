@@ -14,7 +14,7 @@ from palpate.images.alignment import Alignment, Motion, align, moved
 from palpate.images.checks import check_headers, check_images, later_names, refuse_absent, refuse_unit
 from palpate.images.registration import ON, Registration, registration
 from palpate.images.segmentation import Segmentation
-from palpate.images.surface_alignment import align_surfaces, surface_maps
+from palpate.images.surface_alignment import SurfaceMaps, align_surfaces, surface_maps
 from palpate.images.tissue import Role
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import DataSource
@@ -103,12 +103,13 @@ def brought(
     Raises `InputDataError` as `align` and `align_surfaces`.
     """
     images, bones, findings, alignments = [], [], list[Finding](), list[Registration]()
+    maps: SurfaceMaps | None = None
     if method == "none":
         for name, image in zip(later_names(len(after)), after, strict=True):
             progress(f"looking for a motion of the whole in '{name}'")
             findings += check_headers(before.grid, image.grid, name)
             with suppress(InputDataError):  # too little is seen for a motion of the whole; nothing rests on it here
-                maps = surface_maps(before, image)
+                maps = surface_maps(before, image, maps)
                 found = registration(before, maps, align_surfaces(before, maps), by="surfaces")
                 findings += _frame_findings(before, found, name, aligned=False)
         return ImagedStates(before, after, tuple(dict[int, Motion]() for _ in after), tuple(findings))
@@ -117,7 +118,7 @@ def brought(
         progress(f"aligning '{name}' on {ON[method]}")
         findings += check_headers(before.grid, image.grid, name)
         alignment = align(before, image) if rigid or method == "rigid-tissues" else None
-        maps = surface_maps(before, image)
+        maps = surface_maps(before, image, maps)
         fit = alignment.overall if alignment and method == "rigid-tissues" else align_surfaces(before, maps)
         alignments.append(registration(before, maps, fit, by=method))
         progress(f"'{name}' {alignments[-1].in_words}")

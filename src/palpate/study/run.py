@@ -21,7 +21,6 @@ from palpate.study.case import Case, Mechanics
 from palpate.study.case_body import LAW_NAMES
 from palpate.study.case_loads import load_warnings
 from palpate.study.cost import ExpectedCost, expected_cost, refuse_lack
-from palpate.study.estimate_findings import variation_findings
 from palpate.study.estimated import Estimation
 from palpate.study.estimation import Observed, conclude
 from palpate.study.imaged import ImagedStates
@@ -32,6 +31,7 @@ from palpate.study.provenance import image_names, input_digests, software_versio
 from palpate.study.read import read_case_images, read_states
 from palpate.study.refusals import linear_strain_warnings
 from palpate.study.result import CaseResult, MeshResult, MeshSummary, PairResult, Provenance
+from palpate.study.stated_posterior import StatedPosterior
 from palpate.study.variations import Variation, voxel_mm, what_would_change
 from palpate.uncertainty import FittedState
 from palpate.unknowns import ParameterMap
@@ -104,6 +104,12 @@ def estimate_states(
     best = inversion.objective.parameters.in_words(inversion.minimum.unknowns)
     progress(Line(f"best fit: {best}; how far can it be off?", "intervals"))
     stating = during("intervals", progress)
+
+    def vary(posterior: StatedPosterior) -> tuple[Variation, ...]:
+        """What would change the answer."""
+        stating("what would change the answer: surfaces, constants, frame and law, one after the other")
+        return _what_would_change(inversion, settings, case, bodies, posterior)
+
     estimation = conclude(
         inversion,
         settings,
@@ -111,13 +117,9 @@ def estimate_states(
         truth=truth or {},
         seed=case.seed,
         samples=case.estimate.samples,
+        vary=vary,
         progress=stating,
     )
-    if inversion.minimum.converged:
-        stating("what would change the answer: surfaces, constants, frame and law, one after the other")
-        variations = _what_would_change(inversion, settings, case, bodies)
-        remarks = (*estimation.remarks, *variation_findings(variations, estimation.estimates))
-        estimation = replace(estimation, variations=variations, remarks=remarks)
     clock.append(time.perf_counter())
     stages = np.diff(clock)
     seconds = {"read": read_seconds, "mesh": stages[0], "assemble": stages[1], "estimate": stages[2]}
@@ -153,7 +155,11 @@ def make_mesh(case: Case, *, progress: Progress = silent) -> MeshResult:
 
 
 def _what_would_change(
-    inversion: Inversion, settings: InversionSettings, case: Case, bodies: tuple[Body, ...]
+    inversion: Inversion,
+    settings: InversionSettings,
+    case: Case,
+    bodies: tuple[Body, ...],
+    posterior: StatedPosterior,
 ) -> tuple[Variation, ...]:
     """What would change the estimate of a case; nothing where the estimate itself cannot be followed.
 
@@ -171,6 +177,7 @@ def _what_would_change(
             [] if case.strained_reference else others,
             dilatation=choose_element(mechanics.element).dilatation,
             voxel_mm=voxel_mm(later),
+            posterior=posterior,
         )
     except EstimationError:
         return ()

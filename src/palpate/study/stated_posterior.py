@@ -23,7 +23,7 @@ from palpate.uncertainty import (
 
 ROUNDS = 3  # largest number of times that models are made exact where profiles end
 MISSED = 1e-2  # of the displacement, in energy: error up to which a model is exact; it moves ends by a few hundredths
-TOLERANCE = 1e-3  # decrement of the minimum under the likeliest explanation
+TOLERANCE = 1e-6  # decrement of the minimum under the likeliest explanation, from which profiles and regions begin
 STAYS = 0.1  # of the half-width: largest change of an end with which the rounds stop
 
 
@@ -31,13 +31,14 @@ STAYS = 0.1  # of the half-width: largest change of an end with which the rounds
 class StatedPosterior:
     """The posterior of the likeliest explanation, frozen, its minimum, and the mixture over all of them.
 
-    intervals: of each parameter, by that explanation alone; none where nothing converged.
+    intervals: of each parameter, by that explanation alone; none where nothing converged. objective: what was frozen.
     """
 
     frozen: Posterior
     minimum: Minimum
     mixture: StatedMixture
     intervals: tuple[ModulusInterval, ...] = ()
+    objective: Objective | None = None
 
     @property
     def covariance(self) -> NDArray[np.float64]:
@@ -51,7 +52,7 @@ def as_stated(inversion: Inversion, own: Covariance, bounds: Bounds) -> StatedPo
     mixture = stated_mixture(inversion.mixture, own, objective.parameters.blocks)
     frozen = cheapest_posterior(objective, minimum.unknowns, minimum.evaluation)
     least = gauss_newton(frozen, inversion.mixture.minimum.unknowns, bounds=bounds, tolerance=TOLERANCE)
-    posterior = StatedPosterior(frozen, least, mixture)
+    posterior = StatedPosterior(frozen, least, mixture, objective=objective)
     return exact_at_ends(profiled(posterior, bounds), objective, bounds) if minimum.converged else posterior
 
 
@@ -100,7 +101,7 @@ def exact_at_ends(posterior: StatedPosterior, objective: Objective, bounds: Boun
             break
         bent = objective.bent_as(models)
         exact = cheapest_posterior(bent, least.unknowns, bent(least.unknowns))
-        posterior, known = profiled(replace(posterior, frozen=exact), bounds), {**known, **moved}
+        posterior, known = profiled(replace(posterior, frozen=exact, objective=bent), bounds), {**known, **moved}
     return posterior
 
 

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion import Bounds, Inversion
+from palpate.inversion import Bounds, Inversion, Posterior
 from palpate.parallel import mapped
 from palpate.study.stated_posterior import StatedPosterior
 from palpate.uncertainty import (
@@ -79,16 +79,18 @@ class ModulusRegion:
     open: bool
 
 
-def image_pairs_of(inversion: Inversion, bounds: Bounds, errors: GridErrors) -> ImagePairs | None:
+def image_pairs_of(
+    inversion: Inversion, bounds: Bounds, errors: GridErrors, frozen: Posterior | None = None
+) -> ImagePairs | None:
     """Of the later images of a converged estimate, where two or more have a minimum alone; else None.
 
-    errors: of the residuals on random grids, see `grid_errors`.
+    errors: of the residuals on random grids, see `grid_errors`; frozen: the posterior, where it is known so.
     """
     mapping = inversion.objective.parameters
     if len(inversion.objective.states) < 2 or not inversion.minimum.converged:
         return None
     scale, names = mapping.scale_kpa, mapping.tissues
-    every = pair_estimates(inversion.objective, inversion.minimum, bounds, errors)
+    every = pair_estimates(inversion.objective, inversion.minimum, bounds, errors, frozen)
     usable = every.converged
     if np.count_nonzero(usable) < 2:
         return None

@@ -16,6 +16,7 @@ from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.laws.contract import Law
 from palpate.observation.contract import Imaged, OfMaterial
 from palpate.parallel import mapped
+from palpate.study.stated_posterior import StatedPosterior
 from palpate.uncertainty import (
     Equilibria,
     Errors,
@@ -141,13 +142,17 @@ def what_would_change(
     *,
     dilatation: Dilatation,
     voxel_mm: float,
+    posterior: StatedPosterior | None = None,
 ) -> tuple[Variation, ...]:
     """What an estimate rests on, in few lines: known modulus, surfaces by half a voxel, Poisson's ratios, frame, law.
 
     laws: others than that of the estimate, which none has that measures what depends on the material directly, as a
-    force does; otherwise as `fast_variations`.
+    force does; posterior: what is stated of the estimate, where it is there; otherwise as `fast_variations`.
     """
-    path, minimum = fast_path(inversion.objective, inversion.minimum, settings.bounds), inversion.minimum
+    minimum, known = inversion.minimum, None
+    if posterior is not None and posterior.objective is inversion.objective:  # no model was made more exact since
+        known = posterior.frozen, posterior.minimum
+    path = fast_path(inversion.objective, minimum, settings.bounds, known)
     names, equilibria = inversion.objective.parameters.tissues, _equilibria(inversion)
     blocks = inversion.objective.parameters.blocks
     inputs = [
@@ -158,7 +163,7 @@ def what_would_change(
 
     changes: list[tuple[tuple[str, str, str], Callable[[], Shift]]] = [
         ((each.cause, each.subject, words), partial(path.shift, pulled(amount)))
-        for each, pulled in zip(inputs, mapped(lambda each: path.pulled(each.errors), inputs), strict=True)
+        for each, pulled in zip(inputs, path.pulled([each.errors for each in inputs]), strict=True)
         for amount, words in each.amounts
     ]
     frame = np.concatenate([np.zeros(0, dtype=bool), *(np.full(b.size, b.cause == "frame") for b in blocks)])
@@ -167,7 +172,7 @@ def what_would_change(
 
     def under(law: Law) -> Callable[[], Shift]:
         """What a step to another law's equilibrium does."""
-        return lambda: path.shift(path.pulled(law_errors(minimum.evaluation, equilibria, law, dilatation))(1.0))
+        return lambda: path.shift(path.pulled([law_errors(minimum.evaluation, equilibria, law, dilatation)])[0](1.0))
 
     bound = any(isinstance(o, OfMaterial) for o in inversion.objective.observations)
     changes += [(("law", "", law.name), under(law)) for law in laws if not bound]

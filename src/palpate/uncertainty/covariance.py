@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from palpate.images.distance import cropped, window_of
+from palpate.images.distance import NearMaps, cropped, window_of
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.inversion.hyper_parameters import of_one_noise
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
 from palpate.mesh.space import LagrangeSpace
-from palpate.mesh.voxelise import voxelise
+from palpate.mesh.voxelise import DeformedFaces
 from palpate.observation.contract import Imaged
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, mean_noise
@@ -29,6 +29,7 @@ GridErrors = Sequence[Sequence[NDArray[np.float64]]]
 
 GRID_DRAWS = 8
 ROUNDING = 1e-6  # share of a variance that is only rounding, as of blocks that are held
+TOLD = 1e-3  # share of the images in what is known of a combination, below which the fit takes no errors for it
 MARGIN_MM, MARGIN_VOXELS = 12.0, 8.0  # of the grid around the residuals' places, wider than the maps' smoothing
 
 
@@ -282,13 +283,16 @@ def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
     linearisations, found = evaluation.linearisations, {}
     inverse = evaluation.covariance_columns(evaluation.matrix.size)
     for key, (own, telling) in of_one_noise(evaluation).items():
-        gains, columns = list[Jacobian](), linearisations[own[0]].columns
-        for term in (linearisations[i] for i in own):  # W J H^-1, its part of the gain's transpose
+        columns = linearisations[own[0]].columns
+        of_data = evaluation.matrix.block(columns, columns) - evaluation.prior.block(columns, columns)
+        told = _told(inverse[np.ix_(columns, columns)], of_data)
+        gains = list[Jacobian]()
+        for term in (linearisations[i] for i in own):  # W J T, its part of the gain's transpose
             weights = sparse.diags_array(term.precision * term.weights)
             seen = sparse.csr_matrix(weights @ term.jacobian.by_displacement)
-            gains.append(Jacobian(seen, term.jacobian.tangent @ inverse[np.ix_(columns, columns)]))
+            gains.append(Jacobian(seen, term.jacobian.tangent @ told))
         response = FitResponse(
-            [linearisations[i].jacobian for i in telling],
+            [replace(of := linearisations[i].jacobian, tangent=of.tangent @ told) for i in telling],
             gains,
             places=[linearisations[i].residuals.material for i in own],
             normals=[linearisations[i].residuals.normals for i in own],
@@ -296,6 +300,21 @@ def error_noise(evaluation: Evaluation) -> dict[tuple[int, str], NoiseModel]:
         found[key] = linearisations[own[0]].observation.fitted_noise(
             [linearisations[i].residuals for i in telling], response
         )
+    return found
+
+
+def _told(covariance: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """T (n, k) of combinations of unknowns with T T^T = C (n, n) but for what images do not tell.
+
+    The combinations are independent of each other under the covariance C and under the images' information (n, n), of
+    which each has a share h = T^T M T in what is known of it, and those with hardly any are left out.
+    """
+    known = np.isfinite(np.diag(covariance))
+    sizes, axes = np.linalg.eigh(covariance[np.ix_(known, known)])
+    root = axes * np.sqrt(np.maximum(sizes, 0.0))
+    shares, turn = np.linalg.eigh(root.T @ information[np.ix_(known, known)] @ root)
+    found = np.zeros((len(known), np.count_nonzero(shares > TOLD)))
+    found[known] = root @ turn[:, shares > TOLD]
     return found
 
 
@@ -327,7 +346,8 @@ def grid_errors(
 
     Every draw has a generator of its own, so that they can be made side by side.
     """
-    return mapped(lambda own: imaging_errors(objective, evaluation, states, rng=own), rng.spawn(draws))
+    faces = _faces(objective, states)
+    return mapped(lambda own: _imaging_errors(objective, evaluation, states, faces, own, MARGIN_MM), rng.spawn(draws))
 
 
 def scatter(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -382,22 +402,43 @@ def imaging_errors(
     The model, at rest and deformed, is turned into voxels on grids shifted at random by up to half a voxel, at least
     within a margin of the residuals' places; later states of one reference state have the same image of it.
     """
-    errors, rest = list[NDArray[np.float64]](), dict[int, Segmentation]()
+    return _imaging_errors(objective, evaluation, states, _faces(objective, states), rng, margin_mm)
+
+
+def _faces(objective: Objective, states: tuple[FittedState, ...]) -> list[tuple[DeformedFaces, DeformedFaces]]:
+    """The faces of every later state at rest, one for all of a reference state, and deformed."""
+    rest = dict[int, DeformedFaces]()
+    for state, fitted in zip(objective.states, states, strict=True):
+        if state.reference not in rest:
+            rest[state.reference] = DeformedFaces.of(fitted.space, np.zeros_like(fitted.displacement))
+    pairs = zip(objective.states, states, strict=True)
+    return [(rest[state.reference], DeformedFaces.of(fitted.space, fitted.displacement)) for state, fitted in pairs]
+
+
+def _imaging_errors(
+    objective: Objective,
+    evaluation: Evaluation,
+    states: tuple[FittedState, ...],
+    faces: Sequence[tuple[DeformedFaces, DeformedFaces]],
+    rng: np.random.Generator,
+    margin_mm: float,
+) -> list[NDArray[np.float64]]:
+    """Those of `imaging_errors`, by the faces of each state at rest and deformed."""
+    errors, rest = list[NDArray[np.float64]](), dict[int, NearMaps]()
     references = [state.reference for state in objective.states]
     for s, (reference, fitted) in enumerate(zip(references, states, strict=True)):
         linearisations: list[Linearisation] = [term for term in evaluation.linearisations if term.state == s]
         if not any(isinstance(term.observation, Imaged) for term in linearisations):
             errors += [np.zeros(len(term.weights)) for term in linearisations]
             continue
+        at_rest, deformed = faces[s]
         if reference not in rest:
             material = [
                 term.residuals.material for term in evaluation.linearisations if references[term.state] == reference
             ]
-            rest[reference] = _imaged(
-                fitted.space, np.zeros_like(fitted.displacement), fitted.before, material, margin_mm, rng
-            )
+            rest[reference] = NearMaps(_imaged(at_rest, fitted.before, material, margin_mm, rng))
         places = [term.residuals.places for term in linearisations]
-        after = _imaged(fitted.space, fitted.displacement, fitted.after, places, margin_mm, rng)
+        after = NearMaps(_imaged(deformed, fitted.after, places, margin_mm, rng))
         for term in linearisations:
             seen, error = term.observation, np.zeros(len(term.weights))  # none of what no segmented image shows
             if isinstance(seen, Imaged):
@@ -407,8 +448,7 @@ def imaging_errors(
 
 
 def _imaged(
-    space: LagrangeSpace,
-    displacement: NDArray[np.float64],
+    faces: DeformedFaces,
     grid: VoxelGrid,
     places: Sequence[NDArray[np.float64]],
     margin_mm: float,
@@ -420,4 +460,4 @@ def _imaged(
     affine = np.array(near.affine)
     affine[:3, 3] += affine[:3, :3] @ rng.uniform(-0.5, 0.5, 3)
     shifted = replace(near, affine=affine)
-    return Segmentation(voxelise(space, displacement, shifted, crossing=True), shifted, space.mesh.tissues)
+    return Segmentation(faces.on(shifted, crossing=True), shifted, faces.mesh.tissues)

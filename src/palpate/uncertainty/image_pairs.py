@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from palpate.inversion import Bounds, Minimum, Objective, fixed_correspondence, gauss_newton
+from palpate.inversion import (
+    Bounds,
+    FrozenPosterior,
+    Minimum,
+    Objective,
+    Posterior,
+    fixed_correspondence,
+    gauss_newton,
+)
 from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty.covariance import (
     GridErrors,
@@ -31,6 +39,7 @@ from palpate.unknowns import Choice
 OUTLIER = 0.01  # probability of a false outlier among all pairs
 MOST_OUTLIERS = 4  # at most one pair of four is an outlier; where more differ, the pairs vary and none is wrong
 LEAST_PAIRS = 3  # of two pairs that differ, either may be wrong
+NEAR = 1e-4  # decrement of the minimum of a pair alone
 BETWEEN_GRIDS = 0.5  # factor on the covariance of two pairs from few draws, which keeps the whole positive
 
 
@@ -68,15 +77,18 @@ class Agreement:
     covariance: NDArray[np.float64]
 
 
-def pair_estimates(objective: Objective, minimum: Minimum, bounds: Bounds, errors: GridErrors) -> PairEstimates:
+def pair_estimates(
+    objective: Objective, minimum: Minimum, bounds: Bounds, errors: GridErrors, frozen: Posterior | None = None
+) -> PairEstimates:
     """The estimate of each later state alone, near the joint `minimum`: with its closest points, weights and prior.
 
     The covariance has parts by noise and prior, by blocks that are held, by the place of the grid (see
     `grid_covariance`), and by the mesh, which those of one reference share.
-    errors: of the residuals on random grids (see `grid_errors`). Nothing is solved; the approximations of the joint
-    estimate stand. Raises `EstimationError` where a state alone leaves a driver's motion open.
+    errors: of the residuals on random grids (see `grid_errors`); frozen: the posterior, where it is known as a frozen
+    one. Nothing is solved; the approximations of the joint estimate stand. Raises `EstimationError` where a state alone
+    leaves a driver's motion open.
     """
-    alone = _each_alone(objective, minimum, bounds)
+    alone = _each_alone(objective, minimum, bounds, frozen)
     noise, prior = _noise_and_prior(objective, alone)
     n, n_pairs, mapping = objective.n_parameters, len(alone), objective.parameters
     held = np.zeros((mapping.n_unknowns, n * n_pairs))  # J_b^T W J H_s^-1 e_i
@@ -103,8 +115,11 @@ def pair_estimates(objective: Objective, minimum: Minimum, bounds: Bounds, error
     return PairEstimates(theta, covariance, np.array([of.converged for of in alone]))
 
 
-def _each_alone(objective: Objective, minimum: Minimum, bounds: Bounds) -> list[Minimum]:
-    """The minimum of each later state alone, its unknowns those of `ParameterMap.alone`."""
+def _each_alone(objective: Objective, minimum: Minimum, bounds: Bounds, frozen: Posterior | None) -> list[Minimum]:
+    """The minimum of each later state alone, its unknowns those of `ParameterMap.alone`.
+
+    Where its posterior is frozen, that is where it is sought; its residuals are then evaluated once.
+    """
     found = list[Minimum]()
     for s, state in enumerate(objective.states):
         parameters, own = objective.parameters.alone(s)
@@ -113,7 +128,9 @@ def _each_alone(objective: Objective, minimum: Minimum, bounds: Bounds) -> list[
         start = minimum.unknowns[own]
         evaluation = replace(minimum.evaluation, linearisations=linearisations)
         fixed = fixed_correspondence(Objective((state,), parameters), start, evaluation)
-        found.append(gauss_newton(fixed, start, bounds=bounds, tolerance=1e-4))
+        alone = frozen.alone(s) if isinstance(frozen, FrozenPosterior) else fixed
+        least = gauss_newton(alone, start, bounds=bounds, tolerance=NEAR)
+        found.append(least if alone is fixed else replace(least, evaluation=fixed(least.unknowns)))
     return found
 
 

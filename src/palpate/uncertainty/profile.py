@@ -7,6 +7,7 @@ Of two moduli it is a region, drawn beside the ellipse.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from palpate.errors import SolverError
 from palpate.inversion import (
     Bounds,
     FixedCorrespondence,
+    FrozenPosterior,
     LeastSquares,
     LinearisedObjective,
     Minimum,
@@ -24,6 +26,7 @@ from palpate.inversion import (
     Outcome,
     fixed_correspondence,
     gauss_newton,
+    newton_step,
     posterior_sd,
     with_correlations,
     with_scales,
@@ -33,7 +36,8 @@ TRIALS = 12  # points on a ray from the estimate
 DIRECTIONS = 16  # of a joint region
 JOINT_LEVEL = float(np.sqrt(special.chdtri(2, 0.05)))  # root deviance on its boundary: two degrees of freedom
 TRIES = 3  # searches at a point, each with as many steps as a minimum
-NEAR = 0.05  # of the level: accuracy of an end before a straight line corrects it
+NEAR = 0.05  # of the level: accuracy of an end before the line through the last two points corrects it
+NEARER = 0.02  # before the line through the minimum and the only point does
 FURTHEST = 2.0  # largest extrapolation, times the distance of the last point
 PASSES = 10
 SETTLED = 0.02  # posterior standard deviations
@@ -120,7 +124,12 @@ class Ray:
         return slope
 
     def _at_its_best(self, start: NDArray[np.float64]) -> Minimum:
-        """The minimum over all that is not held, sought from unknowns (n,), and again from where a search stopped."""
+        """The minimum over all that is not held, sought from unknowns (n,), and again from where a search stopped.
+
+        Where all log-moduli are held, a frozen posterior is a parabola of the others: one step leads to its minimum.
+        """
+        if self.held.all() and isinstance(self.fixed, FrozenPosterior):
+            return at_held_moduli(self.fixed, start)
         bounds = self.bounds.fixed(start[: len(self.held)], self.held)
         for _ in range(TRIES):
             found = gauss_newton(self.fixed, start, bounds=bounds, tolerance=ON_RAY)
@@ -158,8 +167,8 @@ class Ray:
                 return points, None
             points.append((distance, root, found.unknowns))
             slope = (found.unknowns - least) / distance
-            if abs(root - level) < NEAR * level:
-                return points, distance * level / root
+            if abs(root - level) < (NEAR if len(points) > 1 else NEARER) * level:
+                return points, _on_line(points, level)
             if root < level:
                 if at_bound:
                     return points, None
@@ -172,6 +181,22 @@ class Ray:
                 (near, low), (far, high) = inside, outside
                 distance = near + (far - near) * float(np.clip((level - low) / (high - low), 0.1, 0.9))
         return points, distance
+
+
+def _on_line(points: Sequence[RayPoint], level: float) -> float:
+    """Where a line through the last two points, or the minimum and the only one, meets the level of the root."""
+    (near, low, _), (far, high, _) = points[-2:] if len(points) > 1 else ((0.0, 0.0, None), points[0])
+    rise = (high - low) / (far - near)
+    return far + (level - high) / (rise if rise > 0.1 * high / far else high / far)
+
+
+def at_held_moduli(posterior: FrozenPosterior, start: NDArray[np.float64]) -> Minimum:
+    """The minimum over all but the log-moduli of unknowns (n,), with the evaluation at `start` but for the value."""
+    there, n = posterior(start), posterior.n_parameters
+    step = newton_step(there, np.arange(len(start)) >= n, n)
+    least = replace(there, value=there.value + 0.5 * float(there.score @ step))
+    outcome = Outcome.CONVERGED if np.isfinite(least.value) else Outcome.NOT_FINITE
+    return Minimum(start + step, least, outcome, (), 1)
 
 
 def refitted(
@@ -226,14 +251,15 @@ def joint_region(
     least, pair = gauss_newton(fixed, minimum.unknowns, bounds=bounds, tolerance=1e-6), list(numbers)
     own = least.evaluation.covariance_columns(fixed.n_parameters)[np.ix_(pair, pair)]
     held = np.isin(np.arange(fixed.n_parameters), pair)
-    centre, edge, cut = least.unknowns[pair], list[NDArray[np.float64]](), False
+    centre, edge, cut, first = least.unknowns[pair], list[NDArray[np.float64]](), False, JOINT_LEVEL
     angles = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ np.linalg.cholesky(covariance).T  # V^-1 norm 1
     for along in directions:
         direction = np.zeros(fixed.n_parameters)
         direction[pair] = along
         ray = Ray(fixed, least, direction, held, bounds, 1.0 / float(along @ np.linalg.solve(own, along)))
-        points, end = ray.to_level(JOINT_LEVEL, first=JOINT_LEVEL)
+        points, end = ray.to_level(JOINT_LEVEL, first=first)  # the boundary is smooth: from where the last one lay
+        first = end or JOINT_LEVEL
         reached = end if end is not None else max((distance for distance, *_ in points), default=0.0)
         cut = cut or end is None
         edge.append(centre + reached * along)

@@ -22,11 +22,14 @@ from palpate.inversion import (
     FrozenPosterior,
     Minimum,
     Objective,
+    Outcome,
     Posterior,
     cheapest_posterior,
-    frozen_posterior,
     gauss_newton,
+    newton_step,
+    pulls_of,
 )
+from palpate.mechanics.chord import chord_equilibria
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import FiniteStrainEquilibrium, FiniteStrainModel, finite_strain_model
 from palpate.mechanics.hyperelastic import elements_of
@@ -40,6 +43,10 @@ from palpate.uncertainty.profile import PASSES, refitted
 
 TOLERANCE = 1e-6  # decrement of a minimum
 STEPS = 120  # at the most, for a modulus that moves far
+ACCELERATED, DEPENDENT = 12, 1e-8  # steps near the estimate, at the most; relative size of dependent ones, squared
+SHORT = 1e-4  # decrement before the last step, after which a hundredth of it is left at the most
+FAR = 0.75  # of ln E: a step that is sought with a trust region
+SIDE_BY_SIDE, CHORDS = 1e-2, 12  # of the forces, where images of one body go there together, and their iterations
 COARSE = NewtonSettings(tolerance=2e-2, step_tolerance=2e-2)  # of the forces, under another law
 DERIVATIVES = 1e-4  # relative residual of those by Poisson's ratios
 ITERATIONS = 120  # with a factorisation of other moduli
@@ -79,18 +86,18 @@ class FastPath:
         moved = replace(self.minimum, evaluation=_moved(self.minimum.evaluation, errors))
         return self._shift(refitted(self.objective, moved, self.bounds, max_steps=STEPS, passes=passes)[0])
 
-    def pulled(self, errors: Errors) -> Callable[[float], Posterior]:
-        """The posterior by its amount, whose residuals change by that many times e (n,) mm, of each observation."""
+    def pulled(self, changes: Sequence[Errors]) -> list[Callable[[float], Posterior]]:
+        """Of several changes the posterior by its amount, whose residuals change by that many times e (n,) mm."""
         at, evaluation, held = self.minimum.unknowns, self.minimum.evaluation, self.posterior
-        if not isinstance(held, FrozenPosterior):
-            return lambda amount: cheapest_posterior(
-                self.objective, at, _moved(evaluation, tuple(amount * error for error in errors))
-            )
-        ends = frozen_posterior(self.objective, at, _moved(evaluation, errors)).states
-        ways = [(state, end.form - state.form) for state, end in zip(held.states, ends, strict=True)]
-        return lambda amount: replace(
-            held, states=tuple(replace(state, form=state.form + amount * way) for state, way in ways)
-        )
+        if isinstance(held, FrozenPosterior):
+            return [partial(held.pulled, pulls) for pulls in pulls_of(self.objective, at, evaluation, changes)]
+
+        def moved(errors: Errors, amount: float) -> Posterior:
+            """The posterior under one change, made anew."""
+            changed = tuple(amount * error for error in errors)
+            return cheapest_posterior(self.objective, at, _moved(evaluation, changed))
+
+        return [partial(moved, errors) for errors in changes]
 
     def shift(
         self, posterior: Posterior | None = None, *, width: float = 1.0, dropped: NDArray[np.bool_] | None = None
@@ -113,11 +120,53 @@ class FastPath:
             if dropped is not None:
                 start[n:] = np.where(dropped, 0.0, start[n:])
             changed = changed.believing(replace(parameters, priors=tuple(priors)))
-        return self._shift(gauss_newton(changed, start, bounds=self.bounds, tolerance=TOLERANCE, max_steps=STEPS))
+        near = _accelerated(changed, start, self.bounds)
+        if near.converged:
+            return self._shift(near)
+        found = gauss_newton(
+            changed,
+            near.unknowns,
+            bounds=self.bounds,
+            tolerance=TOLERANCE,
+            max_steps=STEPS,
+            begin=near.evaluation,
+        )
+        return self._shift(found)
 
     def _shift(self, found: Minimum) -> Shift:
         theta, least = (of.unknowns[: self.objective.n_parameters] for of in (found, self.least))
         return Shift(theta - least, self.bounds.reached(theta), found.converged)
+
+
+def _accelerated(posterior: Posterior, start: NDArray[np.float64], bounds: Bounds) -> Minimum:
+    """Where Newton's steps from unknowns (n,) lead as long as they lead down inside of the bounds.
+
+    It is a minimum where the last step is so short that nothing need be evaluated after it.
+
+    Anderson's acceleration in the Gauss-Newton matrix' norm (Walker & Ni, SIAM J. Numer. Anal. 49 (2011) 1715): the
+    matrix lacks how models bend, and steps alone come nearer by the same share each time.
+    """
+    n, every = posterior.n_parameters, np.ones(len(start), dtype=bool)
+    unknowns, now, before = start, posterior(start), list[tuple[NDArray[np.float64], NDArray[np.float64]]]()
+    for _ in range(ACCELERATED):
+        if not np.isfinite(now.value) or not bounds.free(unknowns, now.score).all():
+            break
+        step = newton_step(now, every, n)
+        before, ahead = [*before[-n:], (unknowns, step)], step
+        if len(before) > 1:
+            places, steps = (np.diff(np.stack(each, axis=1), axis=1) for each in zip(*before, strict=True))
+            along = steps.T @ np.stack([now.matrix @ column for column in (*steps.T, step)], axis=1)
+            ahead = step - (places + steps) @ np.linalg.lstsq(along[:, :-1], along[:, -1], rcond=DEPENDENT)[0]
+        theta = (unknowns + ahead)[:n]
+        if np.abs(ahead[:n]).max(initial=0.0) > FAR or np.any((theta <= bounds.lower) | (theta >= bounds.upper)):
+            break
+        if -0.5 * float(now.score @ step) < SHORT:
+            return Minimum(unknowns + ahead, now, Outcome.CONVERGED, ())
+        there = posterior(unknowns + ahead)
+        if not there.value < now.value:
+            break
+        unknowns, now = unknowns + ahead, there
+    return Minimum(unknowns, now, Outcome.STEPS, ())
 
 
 def _moved(evaluation: Evaluation, errors: Errors) -> Evaluation:
@@ -126,10 +175,15 @@ def _moved(evaluation: Evaluation, errors: Errors) -> Evaluation:
     return replace(evaluation, linearisations=tuple(term.with_errors(error) for term, error in pairs))
 
 
-def fast_path(objective: Objective, minimum: Minimum, bounds: Bounds) -> FastPath:
-    """That of an estimate; raises as `gauss_newton` does."""
-    posterior = cheapest_posterior(objective, minimum.unknowns, minimum.evaluation)
-    least = gauss_newton(posterior, minimum.unknowns, bounds=bounds, tolerance=TOLERANCE)
+def fast_path(
+    objective: Objective, minimum: Minimum, bounds: Bounds, known: tuple[Posterior, Minimum] | None = None
+) -> FastPath:
+    """That of an estimate; raises as `gauss_newton` does.
+
+    known: the posterior with closest points and weights held, and its minimum, where these are there.
+    """
+    posterior, begin = known or (cheapest_posterior(objective, minimum.unknowns, minimum.evaluation), minimum)
+    least = gauss_newton(posterior, begin.unknowns, bounds=bounds, tolerance=TOLERANCE)
     return FastPath(objective, minimum, posterior, least, bounds)
 
 
@@ -215,24 +269,58 @@ def law_errors(
 ) -> Errors:
     """Changes (n,) mm of each observation's residuals when the bodies follow another law at the same moduli.
 
-    Newton's method leads from each equilibrium to that of the other law, with the factorisation that is there. Raises
-    `NotConverged` where there is none.
+    From each equilibrium to that of the other law with the factorisation that is there: images of one body side by side
+    (see `chord_equilibria`), by Newton's method where that does not lead there. Raises `NotConverged` where there is no
+    such equilibrium.
     """
-    changes, made = list[NDArray[np.float64]](), dict[int, FiniteStrainModel]()
-    for there in equilibria:
+    changes, linear = dict[int, NDArray[np.float64]](), dict[int, LinearEquilibrium]()
+    for s, there in enumerate(equilibria):
         if isinstance(there, FiniteStrainEquilibrium):
             exact = there if there.factorisation else there.refactorised()
             other = replace(exact.model, elements=elements_of(exact.model.space, law, dilatation))
-            moduli, factorisation = exact.moduli, exact.factorisation
+            changes[s] = _newton_change(other, exact, exact.moduli, exact.factorisation)
         else:
-            model, moduli, factorisation = there.system.model, there.system.moduli, there.system.factorisation
-            if id(model.space) not in made:  # later images of one body differ in what is prescribed
-                made[id(model.space)] = finite_strain_model(model.space, model.constraint, law, dilatation=dilatation)
-            other = replace(made[id(model.space)].under(model.conditions), material=model.material)
-        coarse = replace(other, settings=COARSE)
-        found = coarse.solve(moduli, there.coefficients, start=there.displacement, nearby=factorisation)
-        changes.append(np.asarray(found.values - there.values))
-    return _of_displacements(evaluation, changes)
+            linear[s] = there
+    while linear:
+        first = next(iter(linear.values())).system
+        alike = [
+            s
+            for s, there in linear.items()
+            if first.model.same_stiffness(there.system.model) and np.array_equal(first.moduli, there.system.moduli)
+        ]
+        made = finite_strain_model(first.model.space, first.model.constraint, law, dilatation=dilatation)
+        of_states = [linear.pop(s) for s in alike]
+        others = [
+            replace(made.under(of.system.model.conditions), material=of.system.model.material) for of in of_states
+        ]
+        found = chord_equilibria(
+            [
+                other.balance(first.moduli, of.coefficients[other.constraint.n_modes :])
+                for other, of in zip(others, of_states, strict=True)
+            ],
+            [of.values for of in of_states],
+            first.factorisation,
+            tolerance=SIDE_BY_SIDE,
+            iterations=CHORDS,
+        )
+        for s, other, of, values in zip(alike, others, of_states, found, strict=True):
+            if values is None:
+                changes[s] = _newton_change(other, of, first.moduli, first.factorisation)
+            else:
+                changes[s] = values - of.values
+    return _of_displacements(evaluation, [changes[s] for s in range(len(equilibria))])
+
+
+def _newton_change(
+    other: FiniteStrainModel,
+    there: LinearEquilibrium | FiniteStrainEquilibrium,
+    moduli: NDArray[np.float64],
+    nearby: Factorisation | None,
+) -> NDArray[np.float64]:
+    """Change (n_dof,) mm from an equilibrium to that of another model; raises `NotConverged`."""
+    coarse = replace(other, settings=COARSE)
+    found = coarse.solve(moduli, there.coefficients, start=there.displacement, nearby=nearby)
+    return np.asarray(found.values - there.values)
 
 
 def _of_displacements(evaluation: Evaluation, changes: Sequence[NDArray[np.float64]]) -> Errors:
