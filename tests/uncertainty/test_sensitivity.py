@@ -200,7 +200,8 @@ def test_a_wide_prior_and_no_prior_are_alike_and_a_narrow_one_is_not(path):
 
 def test_modes_that_are_dropped_are_as_if_they_had_never_been(twins, found, monkeypatch):
     """At minima that are sought further than those of an estimate, which end a thousandth of ln E apart."""
-    monkeypatch.setattr(sensitivity, "TOLERANCE", 1e-12)
+    for tolerance in ("TOLERANCE", "SHORT"):
+        monkeypatch.setattr(sensitivity, tolerance, 1e-12)
     path, dropped = fast_path(found.objective, found.minimum, twins.settings(3.0).bounds), np.arange(12) >= 9
     foretold = path.shift(dropped=dropped).theta
     narrow = (Alternative(np.diag(np.where(dropped, 1e-8, 1.0))),)
