@@ -170,10 +170,10 @@ def make_estimation(displacement: np.ndarray) -> Estimation:
         remarks=(Finding("example", "a warning to be shown"),),
         observations={"surface distance": "the distance between surfaces"},
         explanations=(
-            StatedExplanation(("patchy", "bonded"), (("frame moves",),), 0.8, {"prostate": 58.0, "bladder": 31.5}),
+            StatedExplanation(("patchy", "bonded", "frame moves"), ((),), 0.8, {"prostate": 58.0, "bladder": 31.5}),
             StatedExplanation(
-                ("nearly homogeneous", "layers"),
-                (("frame still", "bladder drawn otherwise"),),
+                ("nearly homogeneous", "layers", "frame still"),
+                (("bladder drawn otherwise",),),
                 0.2,
                 {"prostate": 64.0, "bladder": 29.0},
             ),

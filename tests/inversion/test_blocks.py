@@ -9,7 +9,7 @@ import pytest
 
 from palpate.images.tissue import Role, Tissue
 from palpate.inversion import InverseProblem, LaterState, invert
-from palpate.inversion.mixture import LinearEvidence
+from palpate.inversion.mixture import EVERY, LinearEvidence
 from palpate.inversion.objective import Evaluation
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
@@ -90,7 +90,7 @@ def test_a_frame_is_believed_to_stand_still_to_hardly_move_or_to_move(motion, mo
     prior, nothing = mapping.prior_matrix, np.zeros(len(x))
     matrix = Arrowhead.of(information, mapping.places.images) + prior
     evaluation = Evaluation(0.0, 0.0, -information @ x, matrix, (), prior, nothing)
-    likeliest = LinearEvidence.of(mapping, evaluation, nothing).compared(40)[0]
+    likeliest = LinearEvidence.of(mapping, evaluation, nothing).compared(EVERY)[0]
     believed = np.linalg.inv(mapping.choosing(dict(likeliest.chosen)).prior_matrix.dense)[:n, :n]
     moves = smooth.any(axis=1)
     sd = np.sqrt(np.einsum("pm,mk,pk->p", smooth[moves], believed, smooth[moves]).mean())

@@ -9,14 +9,17 @@ import pytest
 
 from palpate.inversion import (
     Bounds,
+    Candidates,
     Objective,
     cheapest_posterior,
+    gauss_newton,
     mixture_of,
 )
 from palpate.inversion.mixture import SEEN, TRUSTED_SD, LinearEvidence
+from palpate.observation.robust_loss import PowerLaw
 from palpate.unknowns.blocks import Choice
 
-EVERY = 10_000  # more explanations than there are
+EVERY = Candidates(most=10_000)  # more explanations than there are
 FRAME, GLAND, SAC = 4, 5, 6  # numbers of the first image's blocks
 AWAY = np.array([0.2, 0.1])
 
@@ -35,9 +38,9 @@ def place(of, theta=AWAY):
     return np.concatenate([theta, 0.1 * np.cos(np.arange(of.parameters.n_coefficients))])
 
 
-def compared(of, objective, most=EVERY):
+def compared(of, objective, candidates=EVERY):
     x = place(of)
-    return LinearEvidence.of(objective.parameters, objective(x), x).compared(most)
+    return LinearEvidence.of(objective.parameters, objective(x), x).compared(candidates)
 
 
 def mixture_at(objective, unknowns, bounds=None, **named):
@@ -112,7 +115,7 @@ def test_weights_are_those_of_the_exact_evidences(patients, seen):
     """Ln E flat; Laplace's approximation is exact for a linear body."""
     of, objective = seen
     every = dense(patients, of, objective)
-    mixture = mixture_at(objective, place(of), most=EVERY)
+    mixture = mixture_at(objective, place(of), candidates=EVERY)
     found = np.log(mixture.weights)
     expected = np.array([every[tuple(sorted(each.chosen.items()))] for each in mixture.explanations])
     assert len(found) > 2
@@ -195,7 +198,7 @@ def test_choices_that_a_problem_lacks_are_none(patients, dropped):
     of = patients.without(patients.patient(rng), dropped)
     objective = of.objective(rng)
     every = dense(patients, of, objective)
-    mixture = mixture_at(objective, place(of), most=EVERY)
+    mixture = mixture_at(objective, place(of), candidates=EVERY)
     expected = np.array([every[tuple(sorted(each.chosen.items()))] for each in mixture.explanations])
     assert np.log(mixture.weights) - np.log(mixture.weights[0]) == pytest.approx(expected - expected[0], abs=0.01)
 
@@ -328,3 +331,56 @@ def test_minima_of_one_explanation_stay_apart_in_iterations_of_a_search(patients
     places = {each.key: each.theta[0] for each in first.explanations}
     assert all(each.theta[0] == pytest.approx(places[each.key], abs=0.01) for each in same)
     assert mixture.weights.sum() == pytest.approx(1.0)
+
+
+def with_outliers(objective, *, cutoff=2.0, by=12.0):
+    """The objective with robust losses, some of whose readings are off by so many standard deviations."""
+    observations = []
+    for o in objective.observations:
+        seen = o.seen.copy()
+        seen[::4] += by * o.weighting.sd
+        weighting = replace(o.weighting, loss=PowerLaw(cutoff * o.weighting.sd))
+        observations.append(replace(o, seen=seen, weighting=weighting))
+    return objective.with_observations(observations)
+
+
+def robust_minimum(objective, start):
+    return gauss_newton(objective, start, bounds=Bounds(np.full(2, -4.0), np.full(2, 4.0)), tolerance=1e-12)
+
+
+def test_the_level_of_an_explanation_is_that_of_its_robust_losses(patients):
+    """-J - 1/2 ln det H + 1/2 ln det P at its own minimum with its log prior odds: those of two can be compared."""
+    rng = np.random.default_rng(13)
+    of = patients.patient(rng)
+    objective, outlying, found = with_outliers(of.objective(rng)), [], []
+    for k in range(3):
+        chosen = {0: k, 1: k, 2: 0, 3: 0, FRAME: 0, GLAND: 0, SAC: 0}
+        own = objective.believing(objective.parameters.choosing(chosen))
+        minimum = robust_minimum(own, np.zeros(len(of.truth)))
+        there, scenario = minimum.evaluation, Candidates(lambda each, own=chosen: each.chosen == tuple(own.items())[:5])
+        at = cheapest_posterior(objective, minimum.unknowns, there)
+        mixture = mixture_of(at, minimum.unknowns, there, Bounds(np.full(2, -4.0), np.full(2, 4.0)), scenario)
+        (level,) = (each.level for each in mixture.explanations if each.chosen == chosen)
+        priors = zip(own.parameters.blocks, chosen.items(), strict=True)
+        odds = sum(block.alternatives[k].log_odds for block, (i, k) in priors if i in (0, 2, FRAME))
+        determinants = sum(p.log_determinant for p in own.parameters.priors) - there.matrix.log_determinant()
+        found.append(level - (odds - there.value + 0.5 * determinants))
+        squares = sum(t.precision * float(t.weights @ t.residuals.values**2) for t in there.linearisations)
+        outlying.append(there.value - there.prior_value - 0.5 * squares)
+    assert np.ptp(outlying) > 0.1  # or there would be nothing to show
+    assert found == pytest.approx([found[0]] * 3, abs=0.03)
+
+
+@pytest.mark.parametrize("sds", [0.1, 0.3])
+def test_levels_that_are_made_at_different_places_agree(patients, sds):
+    """So many standard deviations from the minimum to both sides, each with the weights there."""
+    rng = np.random.default_rng(13)
+    of = patients.patient(rng)
+    objective, levels = with_outliers(of.objective(rng)), []
+    best = mixture_at(objective, robust_minimum(objective, np.zeros(len(of.truth))).unknowns)
+    for sign in (-1.0, 0.0, 1.0):
+        x = best.minimum.unknowns.copy()
+        x[:2] += sign * sds * best.sd * np.array([1.0, -1.0])
+        levels.append({each.key: each.level for each in mixture_at(objective, x).explanations[:3]})
+    for key in levels[1]:
+        assert [level[key] for level in levels] == pytest.approx([levels[1][key]] * 3, abs=0.1)

@@ -174,6 +174,64 @@ def test_a_reduced_basis_tells_what_its_responses_to_the_material_miss_elsewhere
     assert np.linalg.norm(basis.error(there).missing - missing) < 0.3 * np.linalg.norm(missing)
 
 
+@pytest.fixture(scope="module")
+def responding(body, modes, coefficients):
+    """The linear model, boundary coefficients without material, and a basis with the responses to the material."""
+    model = linear_model(*body, material=modes)
+    homogeneous = np.concatenate([coefficients[0], 0.0 * coefficients[1]])
+    basis, values = reduced_basis(model, MODULI), model.solve(MODULI, homogeneous).values
+    return model, homogeneous, basis.with_material(basis.system.material_responses(values), MODULI, values)
+
+
+def by_material(of, moduli, coefficients):
+    """Derivatives (n_dof, n_material) mm by the material modes."""
+    return of.solve(moduli, coefficients).tangent()[:, of.n_regions + of.n_boundary :]
+
+
+def material_responses(model, moduli, coefficients):
+    """The same of a full model."""
+    return model.solve(moduli, coefficients).tangent()[:, model.n_regions + model.constraint.n_modes :]
+
+
+def misses(found, exact):
+    """Of each response, over its length."""
+    return np.linalg.norm(found - exact, axis=0) / np.linalg.norm(exact, axis=0)
+
+
+def test_a_reduced_basis_has_the_full_model_s_responses_to_the_material_where_they_were_made(responding):
+    model, homogeneous, basis = responding
+    exact = material_responses(model, MODULI, homogeneous)
+    assert misses(by_material(basis.model, MODULI, homogeneous), exact).max() < 1e-6
+    scaled = by_material(basis.model, 7.0 * MODULI, homogeneous)  # nothing but displacements is prescribed
+    assert misses(scaled, exact).max() < 1e-6
+
+
+@pytest.mark.parametrize("away", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.5, -0.5)])
+def test_responses_to_the_material_follow_the_moduli_where_the_displacement_is_made_exact(responding, away):
+    """A factor of e away in the ratio of moduli they are nearer to the full model's than those held, and by half."""
+    model, homogeneous, basis = responding
+    moduli = MODULI * np.exp(away)
+    exact, held = (material_responses(model, at, homogeneous) for at in (moduli, MODULI))
+    there = basis.update(LinearisationPoint(moduli, homogeneous))
+    assert np.array_equal(there.material_at, MODULI)  # no response is made anew
+    found = by_material(there.model, moduli, homogeneous)
+    assert np.mean(misses(found, exact) < misses(held, exact)) > 0.9
+    assert np.linalg.norm(found - exact) < 0.75 * np.linalg.norm(held - exact)
+    assert np.mean(misses(found, exact) ** 2) < 0.5 * np.mean(misses(held, exact) ** 2)
+
+
+def test_derivatives_of_a_patchy_body_by_moduli_are_those_of_the_reduced_model_s_own_differences(
+    responding, coefficients
+):
+    _, homogeneous, basis = responding
+    every, h = np.concatenate(coefficients), 1e-4
+    tangent = basis.model.solve(MODULI, every).tangent()
+    for region, step in enumerate(h * np.eye(2)):
+        ahead, behind = (basis.model.solve(MODULI * np.exp(sign * step), every).values for sign in (1.0, -1.0))
+        assert tangent[:, region] == pytest.approx((ahead - behind) / (2.0 * h), abs=1e-6)
+    assert np.any(tangent[:, :2] != basis.model.solve(MODULI, homogeneous).tangent()[:, :2])
+
+
 def test_an_updated_reduced_basis_misses_nothing_of_what_follows_the_material(body, modes, coefficients, rng):
     """Where it was updated: the material's coefficients there are no combination of the directions that decide."""
     model, every = linear_model(*body, material=modes), np.concatenate(coefficients)

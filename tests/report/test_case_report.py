@@ -26,7 +26,7 @@ from palpate.report.case_report import redrawn_page, write_case_report, write_fa
 from palpate.report.collect import MOST_LATER, collect
 from palpate.report.page import render
 from palpate.report.pairs import drawn_images
-from palpate.report.rows import number
+from palpate.report.rows import explanation_rows, number
 from palpate.study.case import Mechanics
 from palpate.study.together import ImagePairs, ModulusRegion, PairAlone
 from palpate.study.variations import Variation
@@ -517,17 +517,25 @@ def test_under_which_explanation_what_stands_in_a_table(page, case_result):
     _, table = page.split("Under which explanation what")
     _, *rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in table.split("</table>")[0].split("<tr>")[1:]]
     assert rows == [
-        ["80 %", "patchy tissues and no layers round organs", "frame moves", "58.0", "31.5"],
+        ["80 %", "patchy tissues, no layers round organs and frame moves", "all drawn alike", "58.0", "31.5"],
         [
             "20 %",
-            "nearly homogeneous tissues and layers round organs",
-            "frame still and bladder drawn otherwise",
+            "nearly homogeneous tissues, layers round organs and frame still",
+            "bladder drawn otherwise",
             "64.0",
             "29.0",
         ],
     ]
     none = dataclasses.replace(case_result.estimation, explanations=())
     assert "Under which explanation what" not in words_of(dataclasses.replace(case_result, estimation=none))
+
+
+def test_of_several_images_those_are_named_that_draw_surfaces_otherwise(case_result):
+    document = case_result.to_dict()
+    first, second = document["explanations"]
+    first["images"] = [{"after": name, "shows": []} for name in ("day 2", "day 9")]
+    second["images"] = [{"after": "day 2", "shows": []}, {"after": "day 9", "shows": ["bladder drawn otherwise"]}]
+    assert [row.images for row in explanation_rows(document)] == [(), (("day 9", "bladder drawn otherwise"),)]
 
 
 def test_a_result_of_one_image_says_nothing_of_repeats(page):

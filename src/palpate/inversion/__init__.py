@@ -17,6 +17,7 @@ from palpate.inversion.hyper_parameters import with_first_noise as with_first_no
 from palpate.inversion.hyper_parameters import with_scales as with_scales
 from palpate.inversion.later_state import InverseProblem as InverseProblem
 from palpate.inversion.later_state import LaterState as LaterState
+from palpate.inversion.mixture import Candidates as Candidates
 from palpate.inversion.mixture import Explanation as Explanation
 from palpate.inversion.mixture import Mixture as Mixture
 from palpate.inversion.mixture import mixture_of as mixture_of

@@ -24,7 +24,7 @@ from palpate.unknowns.parameters import ParameterMap
 
 FITTED = 0.5  # largest share of a kind's residuals that counts as fitted by the unknowns
 DRIVER_LN_SD = float(np.log(2.0))  # standard deviation of ln of a driver's scale over that of its kind
-SWEEPS, SETTLED = 300, 1e-2  # of the amplitudes; relative change of every variance at which they end
+SWEEPS, SETTLED = 300, 3e-3  # of the amplitudes; relative change of every variance at which they end
 
 
 def with_first_noise(objective: Objective) -> Objective:

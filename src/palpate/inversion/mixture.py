@@ -129,30 +129,42 @@ class Mixture:
         return found
 
 
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """The explanations that are compared: those of the scenarios that are `kept`.
+
+    The minima of the likeliest are sought, `most` at most, and `of_group` of one group where that is a number.
+    """
+
+    kept: Callable[[Alternatives], bool] = lambda _: True
+    most: int = MOST
+    of_group: int | None = None
+
+
+EVERY = Candidates()
+
+
 def mixture_of(
     posterior: Posterior,
     unknowns: NDArray[np.float64],
     evaluation: Evaluation,
     bounds: Bounds,
-    kept: Callable[[Alternatives], bool],
+    candidates: Candidates = EVERY,
     *,
     begins: Sequence[NDArray[np.float64]] = (),
-    most: int = MOST,
-    of_group: int | None = None,
     earlier: Mixture | None = None,
 ) -> Mixture:
-    """The posterior of theta over all explanations of the scenarios that are `kept`.
+    """The posterior of theta over the explanations that are `candidates`.
 
     First every explanation is compared with the residuals linear around unknowns (n_unknowns,), within `TRUSTED_SD`
-    there (see `LinearEvidence`). Then the minimum of the likeliest, `most` at most and `of_group` of one group, is
-    found on the `posterior`, however far, that of theta with all else integrated out, with the evidence there. begins
-    (n_unknowns,) each: where further minima of the likeliest explanation are sought; earlier: what is known of
-    explanations near by, where their minima are sought. Raises `EstimationError` where images and prior leave an
-    unknown open, or no minimum can be solved for.
+    there (see `LinearEvidence`). Then the minimum of the likeliest is found on the `posterior`, however far, that of
+    theta with all else integrated out, with the evidence there. begins (n_unknowns,) each: where further minima of the
+    likeliest explanation are sought; earlier: what is known of explanations near by, where their minima are sought.
+    Raises `EstimationError` where images and prior leave an unknown open, or no minimum can be solved for.
     """
     n = posterior.n_parameters
     with determined():
-        compared = LinearEvidence.of(posterior.parameters, evaluation, unknowns).compared(kept, most, of_group)
+        compared = LinearEvidence.of(posterior.parameters, evaluation, unknowns).compared(candidates)
     known = {of.key: (of.minimum.unknowns, of.volume) for of in (earlier.explanations if earlier else ())}
     like = earlier.explanations[0].volume if earlier else None
     jobs = [(of, *known.get((0, tuple(sorted(of.chosen))), (of.unknowns, like))) for of in compared]
@@ -414,15 +426,16 @@ class LinearEvidence:
             eliminated = _Eliminated(own, tuple(steps), -left[:-1, :-1], -left[:-1, -1], level)
             yield _OfImage(frame, alternatives, eliminated)
 
-    def compared(self, kept: Callable[[Alternatives], bool], most: int, of_group: int | None = None) -> list[_Compared]:
-        """The likeliest explanations, `most` at most, of the scenarios that are `kept`, `of_group` of one group.
+    def compared(self, candidates: Candidates) -> list[_Compared]:
+        """The likeliest explanations among the candidates.
 
         Of several images the alternatives of each are chosen in turn, beside those of the others. Which combinations
         are likely is then told by what each of an image's alternatives loses alone.
         """
+        most, of_group = candidates.most, candidates.of_group
         found, counts = list[tuple[float, Alternatives, Callable[[], _Compared]]](), dict[tuple[str, ...], int]()
         for scenario in scenarios_of(self.parameters.blocks):
-            if kept(scenario):
+            if candidates.kept(scenario):
                 found += [(evidence, scenario, minimum) for evidence, minimum in self._of_scenario(scenario, most)]
         best, chosen = max(evidence for evidence, *_ in found), list[_Compared]()
         for evidence, scenario, minimum in sorted(found, key=lambda each: -each[0]):

@@ -16,7 +16,7 @@ from palpate.approximation.expansion import Expansion
 from palpate.errors import EstimationError, NotConverged, SolverError
 from palpate.inversion.frozen_posterior import Posterior, cheapest_posterior
 from palpate.inversion.hyper_parameters import with_amplitudes, with_correlations, with_scales
-from palpate.inversion.mixture import MOST, Mixture, mixture_of
+from palpate.inversion.mixture import MOST, Candidates, Mixture, mixture_of
 from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, gauss_newton
 from palpate.inversion.scenarios import Alternatives, scenarios_of
@@ -184,7 +184,7 @@ def _rivals(now: Searched, bounds: Bounds) -> list[Searched]:
 
     if not any(map(kept, scenarios_of(now.frozen.parameters.blocks))):
         return []
-    seen = mixture_of(now.frozen, at.unknowns, at.evaluation, near, kept, of_group=OF_RIVALS)
+    seen = mixture_of(now.frozen, at.unknowns, at.evaluation, near, Candidates(kept, of_group=OF_RIVALS))
     found = dict[tuple[str, ...], Searched]()
     for of in seen.explanations:
         if of.level > now.posterior.level - RIVAL and of.group not in found:
@@ -237,8 +237,8 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         return not any(k for i, k in scenario.chosen if blocks[i].choice.of_tissues)
 
     exact = now.moved < 1.0
-    most = MOST if exact else FAR_MOST
-    mixture = mixture_of(posterior, at.unknowns, evaluation, near, kept, begins=begins, most=most, earlier=now.mixture)
+    own = Candidates(kept, MOST if exact else FAR_MOST)
+    mixture = mixture_of(posterior, at.unknowns, evaluation, near, own, begins=begins, earlier=now.mixture)
     objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))

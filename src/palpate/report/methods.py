@@ -65,7 +65,7 @@ def methods_text(data: ReportData) -> Methods:
             f"The misfit was {observed}. Outliers counted less: by densities with the tails of a power law, on the"
             f" drivers' walls by Huber's loss {cite('huber')}. The posterior of the moduli's logarithms was a"
             " mixture over what may explain the images: how patchy the tissues are, whether layers lie round organs,"
-            " whether the frame of each image moves, and whether its surfaces are drawn alike. Each explanation counted"
+            " whether the frame moves, and whether each image draws the surfaces alike. Each explanation counted"
             f" by its evidence in Laplace's approximation {cite('laplace')}, at its own minimum over all others."
             f" Minima were found by Gauss-Newton steps in a trust region {cite('nocedal')} on reduced models"
             f" {cite('reduced')}, which were made exact at the posterior's mean. {len(data.document['starts'])} starts"

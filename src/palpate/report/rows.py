@@ -120,7 +120,10 @@ class RatioRow:
 
 @dataclass(frozen=True, slots=True)
 class ExplanationRow:
-    """One explanation of the later images, as texts: its probability, the tissues, each image, and moduli by tissue."""
+    """One explanation of the later images, as texts: its probability, what is so of all of them, and moduli by tissue.
+
+    images: those that show more, by name, which is empty where there is only one.
+    """
 
     probability: str
     scenario: str
@@ -168,7 +171,11 @@ def explanation_rows(document: Mapping[str, Any]) -> tuple[ExplanationRow, ...]:
         ExplanationRow(
             _percent(of["probability"]),
             listed([SCENARIOS.get(word, word) for word in of["scenario"]]) or NONE,
-            tuple((image["after"], listed(image["shows"]) or NONE) for image in of["images"]),
+            tuple(
+                (image["after"] if len(of["images"]) > 1 else "", listed(image["shows"]))
+                for image in of["images"]
+                if image["shows"]
+            ),
             tuple((tissue, number(unit.of_document(value))) for tissue, value in of["moduli"].items()),
         )
         for of in document.get("explanations", ())

@@ -114,7 +114,7 @@ class PointFit:
 class StatedExplanation:
     """One of the explanations of all later images: its probability, and the moduli (kPa, or ratios) under it.
 
-    scenario: what is so of all tissues, images: what is so in each later image, in words.
+    scenario: of all tissues and of the frame, in words; images: which surfaces each later one draws otherwise.
     """
 
     scenario: tuple[str, ...]

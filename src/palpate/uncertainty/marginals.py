@@ -89,7 +89,7 @@ def _groups(mixture: Mixture, blocks: tuple[Block, ...]) -> Mapping[str, NDArray
         alike = np.array([[one == other for other in keys] for one in keys]) * weights
         return np.asarray(alike / alike.sum(axis=1, keepdims=True))
 
-    for choice in (choice for choice in Choice if choice.of_tissues or choice.of_image):
+    for choice in (choice for choice in Choice if choice.of_explanations):
         own = [i for i, block in enumerate(blocks) if block.choice is choice]
         keys = [tuple(of.get(i, 0) for i in own) for of in chosen]
         if len(set(keys)) > 1:

@@ -68,9 +68,9 @@ class Choice(Enum):
         return self in (Choice.PATCHINESS, Choice.LAYERS)
 
     @property
-    def of_image(self) -> bool:
-        """Whether every later image has a choice of its own."""
-        return self is Choice.DRAWING
+    def of_explanations(self) -> bool:
+        """Whether explanations of the later images may differ in it."""
+        return self not in (Choice.NONE, Choice.HELD)
 
 
 @dataclass(frozen=True)
