@@ -60,6 +60,7 @@ Widening = Literal[
     "touching",
 ]
 Harmless = Literal[
+    "added-together",
     "frame-aligned",
     "finer-mesh",
     "front-exchanged",

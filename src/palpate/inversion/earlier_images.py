@@ -63,6 +63,15 @@ class EarlierImages:
     blocks: tuple[KnownBlock, ...]
     laws: tuple[ScenarioLaw, ...]
 
+    def __post_init__(self) -> None:
+        n = len(self.theta) + sum(len(of.rows) for of in self.blocks)
+        shapes = [shape for of in self.laws for shape in (of.likelihood.matrix.shape, of.likelihood.pull.shape)]
+        if not self.laws or shapes != [(n, n), (n,)] * len(self.laws):
+            raise ConfigurationError(f"the laws of earlier images do not have {n} unknowns each, as their blocks do")
+        for of in self.blocks:
+            if of.rows.shape[1:] != (of.size,):
+                raise ConfigurationError(f"combinations {of.rows.shape} are not of the {of.in_words}")
+
     def known_in(self, problem: InverseProblem) -> InverseProblem:
         """The problem of further images of the same body, in which the earlier ones count.
 
@@ -77,8 +86,8 @@ class EarlierImages:
             strange = [of for of in there if of not in here] + [of for of in here if of not in there]
             raise ConfigurationError(
                 f"the earlier estimate knows {n} moduli and {len(there)} groups of other unknowns of the body, this"
-                f" case has {found} and {len(here)}{f', for example {strange[0]}' if strange else ''}; estimate all images"
-                " together"
+                f" case has {found} and {len(here)}{f', for example {strange[0]}' if strange else ''}; estimate all"
+                " images together"
             )
         blocks = list(parameters.blocks)
         for i, of in zip(body, self.blocks, strict=True):

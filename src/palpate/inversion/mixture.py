@@ -234,7 +234,7 @@ def _laplace(
 
 
 def beyond_bounds(covariance: NDArray[np.float64], bounds: Bounds) -> float:
-    """Sum of ln of by how much variances (n, n) of theta are more than bounds leave: 1/12 of their distance's square."""
+    """Sum of ln of by how much variances (n, n) of theta are more than bounds leave, 1/12 of their distance squared."""
     room = bounds.room / np.sqrt(12.0)
     seen = np.isfinite(np.diag(covariance)) & (room > 0.0)
     variances = np.linalg.eigvalsh((covariance / np.outer(*(np.where(seen, room, 1.0),) * 2))[np.ix_(seen, seen)])
@@ -407,13 +407,10 @@ class LinearEvidence:
     def _of_scenario(self, scenario: Alternatives, most: int) -> list[tuple[float, Callable[[], _Compared]]]:
         """Its likeliest explanation, and those seen beside it, `most` at most: evidence, and what finds the minimum."""
         parameters, shared = self.parameters.choosing(dict(scenario.chosen)), self.shared
-        prior, believed = (
-            parameters.prior_matrix.block(shared, shared),
-            parameters.prior_of_blocks.block(shared, shared),
-        )
-        n, centre, earlier = parameters.n_parameters, parameters.prior_centre[shared], parameters.earlier_constant
+        prior, n = parameters.prior_matrix.block(shared, shared), parameters.n_parameters
+        believed, centre = parameters.prior_of_blocks.block(shared, shared), parameters.prior_centre[shared]
         own = 0.5 * (log_det(Arrowhead.of(believed[n:, n:])) - float(centre @ believed @ centre)) + scenario.log_odds
-        own -= earlier
+        own -= parameters.earlier_constant
         information, pull = self.information + prior, self.pull + parameters.prior_pull[shared]
 
         def evidence(numbers: Sequence[int], k: int | None = None) -> list[float]:

@@ -92,10 +92,8 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
         found[s] = found[s].with_material(q)
         states[s] = replace(state, observed=found[s].seen(state, q))
     evaluation = replace(objective, states=tuple(states))(fitted.unknowns)
-    data, columns = (
-        evaluation.matrix - still.prior_of_blocks,
-        [parameters.columns(i) for i in range(len(parameters.blocks))],
-    )
+    columns = [parameters.columns(i) for i in range(len(parameters.blocks))]
+    data = evaluation.matrix - still.prior_of_blocks  # what earlier images tell, too
     middle, evaluations = fitted.unknowns, fitted.evaluations + 1
     # free the large derivatives of everything observed by all unknowns
     del objective, states, state, fitted, evaluation

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from palpate.images.checks import later_names
 from palpate.inversion import (
+    EarlierImages,
     Inversion,
     InversionSettings,
     Iterate,
     Linearisation,
     StartRun,
+    earlier_images,
 )
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, seen_by
@@ -31,7 +33,9 @@ from palpate.study.together import combinations_of, image_pairs_of, regions_of
 from palpate.study.verdicts import IDENTIFIED, estimates_of, intervals_of
 from palpate.uncertainty import (
     GRID_DRAWS,
+    Covariance,
     FittedState,
+    correlated_factor,
     covariance_of,
     grid_errors,
     information,
@@ -134,7 +138,15 @@ def conclude(
         maps=maps,
         explanations=_explanations(inversion) if minimum.converged else (),
         materials=fitted_materials(inversion),
+        images=_told(inversion, settings, own) if minimum.converged else None,
     )
+
+
+def _told(inversion: Inversion, settings: InversionSettings, own: Covariance) -> EarlierImages:
+    """What the images tell, for others that are added; with errors that the posterior leaves out, but the mesh's."""
+    parameters, n_images = inversion.objective.parameters, len(inversion.objective.states)
+    errors = {"wider": correlated_factor(inversion.mixture, own), "beside": own.of_held + own.grid}
+    return earlier_images(inversion.mixture, parameters, settings.bounds, n_images=n_images, **errors)
 
 
 def _reason(inversion: Inversion) -> str:

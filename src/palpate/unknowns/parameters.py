@@ -349,7 +349,7 @@ class ParameterMap:
         return replace(self.believing({i: self.blocks[i].alternatives[k] for i, k in chosen.items()}), levels=levels)
 
     def combined(self, inverses: Sequence[NDArray[np.float64]]) -> ParameterMap:
-        """The map of combinations z = inverse x of each block's unknowns, inverse (k, n), as they are believed at first.
+        """The map of combinations z = inverse x of each block's unknowns, inverse (k, n), as believed at first.
 
         What earlier images say of that which is left out is integrated out under each scenario.
         """
