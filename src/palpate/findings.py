@@ -60,8 +60,8 @@ Widening = Literal[
     "touching",
 ]
 Harmless = Literal[
-    "added-together",
     "frame-aligned",
+    "added-together",
     "finer-mesh",
     "front-exchanged",
     "sides-exchanged",

@@ -15,9 +15,12 @@ from palpate.cli import main
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.readers import write_label_image
 from palpate.phantoms.spheres import SpheresOptions, spheres
+from palpate.progress import silent
 from palpate.study.archive import read_archive, write_archive
+from palpate.study.body import joint_problem, make_body
 from palpate.study.known_images import FORMAT, KnownImages, added_name, digest_of, why_together
 from palpate.study.outputs import KNOWN_IMAGES
+from palpate.study.read import read_states
 
 CASE = """
 [images]
@@ -181,10 +184,6 @@ def known_of(folder: Path) -> KnownImages:
     ],
 )
 def test_what_another_body_has_told_is_refused(inputs, earlier, change, words):
-    from palpate.progress import silent
-    from palpate.study.body import joint_problem, make_body
-    from palpate.study.read import read_states
-
     case = palpate.read_case(inputs / "case.toml")
     body = make_body(read_states(case), case, progress=silent)
     problem, known = joint_problem((body,), case, progress=silent), known_of(earlier)
