@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -87,7 +89,7 @@ def logs(of):
     return {item["tissue"]: np.log([*item["interval95"], item["value"]]) for item in of["estimates"]}
 
 
-def test_an_added_image_counts_as_one_that_was_always_there(inputs, earlier, added, tmp_path):
+def test_an_added_image_counts_as_one_that_was_always_there(inputs, added, tmp_path):
     assert main(["estimate", str(inputs / "all.toml"), "--quiet", "--output", str(tmp_path / "all")]) == 0
     together, found = logs(document(tmp_path / "all")), logs(document(added))
     for tissue, (low, high, value) in together.items():
@@ -96,7 +98,7 @@ def test_an_added_image_counts_as_one_that_was_always_there(inputs, earlier, add
         assert (found[tissue][1] - found[tissue][0]) / 3.92 == pytest.approx(sd, rel=0.3)
 
 
-def test_the_result_says_what_it_builds_on_and_the_earlier_one_stays(inputs, earlier, added):
+def test_the_result_says_what_it_builds_on_and_the_earlier_one_stays(earlier, added):
     found, before = document(added), document(earlier)
     assert found["built_on"]["images"] == 2
     assert found["built_on"]["folder"] == "out"
@@ -208,6 +210,7 @@ def test_a_damaged_file_is_refused(inputs, earlier, tmp_path):
         lambda path: path.write_bytes(path.read_bytes()[:-100]),
         lambda path: path.write_bytes(b"PK"),
         lambda path: write_archive(replace_theta(known), path, version=FORMAT),
+        larger_than_the_file,
     ):
         path = tmp_path / KNOWN_IMAGES
         write_archive(known, path, version=FORMAT)
@@ -220,6 +223,17 @@ def test_a_damaged_file_is_refused(inputs, earlier, tmp_path):
     case = palpate.read_case(inputs / "case.toml")
     with pytest.raises(InputDataError, match="was changed after the estimate"):
         palpate.estimate(case, add=[inputs / "after_3.nii.gz"], earlier=folder, progress=None)
+
+
+def larger_than_the_file(path: Path) -> None:
+    """A head that asks for 8 TB."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)})
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, head.getvalue() if name == "a0.npy" else content)
 
 
 def replace_theta(known: KnownImages) -> KnownImages:

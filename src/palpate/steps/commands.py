@@ -149,8 +149,8 @@ def estimate(
     `earlier`, at the price of these images alone; progress: "auto" shows stages with a bar in a notebook and on a
     terminal, True everywhere, None or False nowhere; a function is called with each sentence. Raises as `make_mesh`
     does, `ConfigurationError` for another number of samples or another case than that of the folder, `ResourceError`
-    where the libraries for samples are not installed, and `EstimationError` where there is no result; an iteration that did not converge is a result whose status says so,
-    without values.
+    where the libraries for samples are not installed, and `EstimationError` where there is no result; an iteration that
+    did not converge is a result whose status says so, without values.
     """
     if samples is not None:
         case = replace(case, estimate=replace(case.estimate, samples=samples))

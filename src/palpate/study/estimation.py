@@ -142,11 +142,19 @@ def conclude(
     )
 
 
-def _told(inversion: Inversion, settings: InversionSettings, own: Covariance) -> EarlierImages:
-    """What the images tell, for others that are added; with errors that the posterior leaves out, but the mesh's."""
+def _told(inversion: Inversion, settings: InversionSettings, own: Covariance) -> EarlierImages | None:
+    """What the images tell, for others that are added; None where that is no normal law.
+
+    With the errors that the posterior leaves out, but the mesh's, which added images share.
+    """
     parameters, n_images = inversion.objective.parameters, len(inversion.objective.states)
-    errors = {"wider": correlated_factor(inversion.mixture, own), "beside": own.of_held + own.grid}
-    return earlier_images(inversion.mixture, parameters, settings.bounds, n_images=n_images, **errors)
+    wider, beside = correlated_factor(inversion.mixture, own), own.of_held + own.grid
+    seen = np.isfinite(wider) & np.isfinite(np.diag(beside))  # a modulus that moves nothing has no errors
+    errors = {"wider": np.where(seen, wider, 1.0), "beside": np.where(np.outer(seen, seen), beside, 0.0)}
+    try:
+        return earlier_images(inversion.mixture, parameters, settings.bounds, n_images=n_images, **errors)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def _reason(inversion: Inversion) -> str:

@@ -334,7 +334,8 @@ class ParameterMap:
         if share is not None:
             share = replace(share, slope=share.slope / self.n_states, numbers=np.searchsorted(own, share.numbers))
         priors = tuple(self.priors[i] for i in kept)
-        return replace(self, blocks=blocks, priors=priors, volume=share, earlier={}), own
+        levels = tuple(level for i, level in zip(self._of_tissues, self.levels, strict=True) if i in kept)
+        return replace(self, blocks=blocks, priors=priors, volume=share, earlier={}, levels=levels), own
 
     def _model_columns(self, state: int) -> NDArray[np.int64]:
         return np.concatenate([self.acting(Acts.BOUNDARY, state), self.acting(Acts.MATERIAL, state)])
