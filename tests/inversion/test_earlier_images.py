@@ -195,3 +195,21 @@ def test_another_body_is_refused(patients):
         ConfigurationError, match=r"knows 2 moduli and 4 groups .* has 2 and 3, for example heterogeneity"
     ):
         law.known_in(other.problem(rng))
+
+
+def test_the_drawing_of_the_reference_image_is_shared_with_an_added_image_and_its_amplitudes_stay(patients):
+    """One that is believed counts as in the joint posterior; of one that is learned nothing is learned anew."""
+    rng = np.random.default_rng(4)
+    plain, modes = patients.patient(rng, 3), rng.standard_normal((patients.N_READ, 2))
+    covariances = [0.02 * np.eye(2), 0.01 * np.ones((2, 2))]
+    problem = patients.drawn_at_rest(plain, modes, covariances).problem(rng)
+    together = invert(problem, patients.settings(), progress=silent).mixture
+    _, found = added(patients, problem, [0, 1], [2])
+    assert np.all(np.abs(found.mixture.mean - together.mean) < 0.1 * np.sqrt(np.diag(together.covariance)))
+    learning = patients.drawn_at_rest(plain, modes, covariances, learned=True).problem(rng)
+    law, before = known(of_images(learning, [0, 1]), patients.settings(), 2)
+    after = invert(law.known_in(of_images(learning, [2])), patients.settings(), progress=silent)
+    for own, other in zip(*(of.objective.parameters.priors[-2:] for of in (before, after)), strict=True):
+        assert len(own.variances) == 2
+        assert other.variances == own.variances
+        assert other.covariance == pytest.approx(own.covariance, rel=1e-12)
