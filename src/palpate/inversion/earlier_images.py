@@ -132,16 +132,12 @@ def earlier_images(
         told = found[likeliest]
         level = told.log_evidence(prior, centre) + scenario.log_odds
         found[levels] = replace(told, constant=told.constant + max(level - (best - SEEN), 0.0))
-    blocks = [(parameters.blocks[i], parameters.priors[i]) for i in parameters.body_blocks]
-    known = tuple(
-        KnownBlock(b.cause, b.of, b.size if b.rows is None else b.rows.shape[1], _rows(b.rows, b.size), p.variances)
-        for b, p in blocks
-    )
-    return EarlierImages(n_images, mixture.mean, known, tuple(ScenarioLaw(*of) for of in found.items()))
-
-
-def _rows(rows: NDArray[np.float64] | None, size: int) -> NDArray[np.float64]:
-    return np.eye(size) if rows is None else rows
+    known = list[KnownBlock]()
+    for i in parameters.body_blocks:
+        block = parameters.blocks[i]
+        rows = np.eye(block.size) if block.rows is None else block.rows
+        known.append(KnownBlock(block.cause, block.of, rows.shape[1], rows, parameters.priors[i].variances))
+    return EarlierImages(n_images, mixture.mean, tuple(known), tuple(ScenarioLaw(*of) for of in found.items()))
 
 
 def _normal_law(
