@@ -249,3 +249,15 @@ def test_folders_are_called_by_the_image():
     assert added_name([Path("a b/after 7.nii.gz")]) == "added-after_7"
     assert added_name([Path("x.nrrd"), Path("y.nrrd")]) == "added-x-and-1-more"
     assert why_together(palpate.read_case, 1).startswith("the earlier estimate has one")
+
+
+def test_an_earlier_estimate_that_leaves_a_modulus_open_is_made_again_with_all_images(inputs, tmp_path):
+    """Its law is far from normal."""
+    case, out = inputs / "open.toml", tmp_path / "open"
+    case.write_text(case_of([1, 2]) + "[estimate]\nbounds_ratio = [0.5, 9.0]\nstart_ratios = [2.0]\n")
+    assert main(["estimate", str(case), "--quiet", "--output", str(out)]) == 0
+    assert KNOWN_IMAGES not in document(out)["files"]
+    result = palpate.estimate(palpate.read_case(case), add=[inputs / "after_3.nii.gz"], earlier=out, progress=None)
+    (warning,) = [of["message"] for of in result.to_dict()["warnings"] if of["code"] == "added-together"]
+    assert "leaves a modulus open" in warning
+    assert len(result.after) == 3

@@ -138,14 +138,15 @@ def conclude(
         maps=maps,
         explanations=_explanations(inversion) if minimum.converged else (),
         materials=fitted_materials(inversion),
-        images=_told(inversion, settings, own) if minimum.converged else None,
+        images=_told(inversion, settings, own) if known and all(None not in of.interval for of in known) else None,
     )
 
 
 def _told(inversion: Inversion, settings: InversionSettings, own: Covariance) -> EarlierImages | None:
-    """What the images tell, for others that are added; None where that is no normal law.
+    """What the images tell, for others that are added; None where that is no law.
 
-    With the errors that the posterior leaves out, but the mesh's, which added images share.
+    With the errors that the posterior leaves out, but the mesh's, which added images share. It is not asked of a
+    posterior with an open end, which is far from normal: added images would be held where nothing tells a modulus.
     """
     parameters, n_images = inversion.objective.parameters, len(inversion.objective.states)
     wider, beside = correlated_factor(inversion.mixture, own), own.of_held + own.grid
