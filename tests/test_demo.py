@@ -106,5 +106,5 @@ def test_the_tutorials_steps_lead_to_the_demos_case(tmp_path, capsys):
     same = {name: getattr(demos, name) for name in ("id", "patient", "images", "tissues")}
     assert replace(case, **same) == demos
     (written,) = re.findall(r"^written to out: (.*)$", SHOWN[-1], flags=re.MULTILINE)
-    asked_for = {"posterior.nc", "stiffness_sd.nii.gz"}  # samples, and a map
+    asked_for = {"posterior.nc", "stiffness_sd.nii.gz", "known-images.npz"}  # samples, a map, several later images
     assert {*written.split(", ")} == {*RESULT_FILES, RESULT, "case.toml", "log.txt"} - asked_for

@@ -61,6 +61,7 @@ Widening = Literal[
 ]
 Harmless = Literal[
     "frame-aligned",
+    "added-together",
     "finer-mesh",
     "front-exchanged",
     "sides-exchanged",

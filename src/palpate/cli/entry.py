@@ -117,6 +117,8 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
     if arguments.output is None or getattr(arguments, "task", None) is not None:  # a task's folder is another run's
         with progress_on_stderr(quiet=arguments.quiet, verbose=arguments.verbose) as progress:
             return command(arguments, case, None, progress)
+    if getattr(arguments, "add", ()):
+        _into_added_folder(arguments)
     if not arguments.makes_folder and not arguments.output.is_dir():
         advice = like(arguments.output) or "; name the output folder of an earlier run"
         raise InputDataError(f"there is no folder {arguments.output}{advice}")
@@ -135,11 +137,20 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
         return command(arguments, case, outputs, progress)
 
 
+def _into_added_folder(arguments: argparse.Namespace) -> None:
+    """Have an estimate of added images write into a folder of its own, in that of the estimate it builds on."""
+    from palpate.study.known_images import added_name
+    from palpate.study.outputs import RESULT, read_json
+
+    read_json(arguments.output / RESULT)  # before a folder is made
+    arguments.output = arguments.output / added_name(arguments.add)
+
+
 def _spare_inputs(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder) -> None:
     """Refuse to write an output in the place of an input."""
     given = () if case is not None and not arguments.set else getattr(arguments, "inputs", ())  # a case stays as it is
     named = (getattr(arguments, name, None) for name in ("labels", "table", "template"))
-    inputs: list[Path | None] = [*given, *named, *getattr(arguments, "ct", ())]
+    inputs: list[Path | None] = [*given, *named, *getattr(arguments, "ct", ()), *getattr(arguments, "add", ())]
     if case is not None and case.images is not None:
         images = case.images
         inputs += [images.before, *images.after, images.names, images.intensities_before, *images.intensities_after]

@@ -47,6 +47,7 @@ EXAMPLES = {
     "estimate": (
         "palpate estimate case/case.toml --output out",
         "palpate estimate out/case.toml --set mechanics.law=linear --samples 1000 --output linear",
+        "palpate estimate case/case.toml --add after_7.nii.gz --output out",
     ),
     "export": (
         "palpate export out --format abaqus --output abaqus",
@@ -195,6 +196,8 @@ def _add_estimates(subparsers: Any) -> None:
     )
     estimate.add_argument("--labels", type=Path, metavar="TABLE", help="label table of the images")
     _add_ct(estimate)
+    what = "add later images to the finished estimate in --output, at their price alone; writes DIR/added-IMAGE"
+    estimate.add_argument("--add", type=Path, nargs="+", default=[], metavar="IMAGE", help=what)
     what = "first write preview.html, which shows what will be estimated; the mesh is then made twice"
     estimate.add_argument("--preview", action="store_true", help=what)
     _add_overwrite(estimate)

@@ -33,6 +33,8 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
 
     if case is not None and arguments.labels is not None:
         raise ConfigurationError("--labels goes with images; a case names its label table itself, as [images] names")
+    if case is None and arguments.add:
+        raise ConfigurationError("--add goes with a case, whose result it adds images to; give its case.toml first")
     if case is not None and arguments.ct:
         raise ConfigurationError("--ct goes with images; a case names its CTs itself, as [images] intensities_before")
     if case is None:
@@ -47,7 +49,7 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
         progress(Line(f"the preview is written to {outputs.path / PREVIEW}"))
     outputs.require(f"mesh_{number}.vtu" for number in range(2, len(case.pairs) + 2))
     try:
-        result = commands.estimate(case, progress=progress)
+        result = commands.estimate(case, add=arguments.add, earlier=outputs.path.parent, progress=progress)
     except EstimationError as error:
         return Outcome(save_failure(case, error, outputs), "", error.exit_code, str(error))
     return _write_estimate(result, outputs, progress)

@@ -24,8 +24,10 @@ from palpate.mesh.locate import tetrahedron_image
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import TetMesh
+from palpate.study.archive import write_archive
 from palpate.study.earlier import seal_of
-from palpate.study.outputs import make_folder, write_text
+from palpate.study.known_images import FORMAT
+from palpate.study.outputs import KNOWN_IMAGES, make_folder, write_text
 from palpate.study.result import CaseResult, MeshResult, Simulation
 from palpate.study.samples import POSTERIOR
 
@@ -48,7 +50,8 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
 
     stiffness_sd.nii.gz, the standard deviation of ln E, where the modulus of a tissue is a field. Each further pair has
     its own mesh_2.vtu, mesh_3.vtu ...; a converged result leaves model.npz for `palpate export`, and posterior.nc where
-    it has samples. Returns the paths written; raises `ResourceError` when the disk refuses.
+    it has samples; known-images.npz is left where later images can be added. Returns the paths written; raises
+    `ResourceError` when the disk refuses.
     """
     make_folder(folder)
     paths = [folder / "mesh.vtu", folder / "stiffness.nii.gz"]
@@ -63,6 +66,9 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     for number, pair in enumerate(result.further, start=2):
         paths.append(folder / f"mesh_{number}.vtu")
         _write_fitted(paths[-1], result, number - 1, pair.space, pair.displacements)
+    if result.known is not None:
+        paths.append(folder / KNOWN_IMAGES)
+        write_archive(result.known, paths[-1], version=FORMAT)
     if result.estimation.status == "converged":
         model = fitted_model(result, seal=seal_of(result.to_dict()))
         paths.append(folder / MODEL)

@@ -1,5 +1,7 @@
 """The inverse problem: from later states and what is observed of them to the moduli that explain them."""
 
+from palpate.inversion.earlier_images import EarlierImages as EarlierImages
+from palpate.inversion.earlier_images import earlier_images as earlier_images
 from palpate.inversion.estimate import Inversion as Inversion
 from palpate.inversion.estimate import InversionSettings as InversionSettings
 from palpate.inversion.estimate import at_finite_strain as at_finite_strain

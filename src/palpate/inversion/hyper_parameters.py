@@ -137,12 +137,13 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
         if block.terms:
             parameters = objective.parameters
             with determined():
-                pulled = pull + parameters.prior_matrix @ parameters.prior_centre
+                pulled = pull + parameters.prior_pull
                 information, of_own = _seen_of(parameters, data, pulled, i)
                 terms = [term + LEAST_VARIANCE * np.eye(block.size) for term in block.terms]
                 variances = evident_variances(terms, information, of_own)
                 covariance = np.tensordot(variances, np.stack(terms), axes=1)
-            objective = objective.believing(parameters.believing({i: Alternative(np.asarray(covariance))}))
+            learned = Alternative(np.asarray(covariance), variances=tuple(variances.tolist()))
+            objective = objective.believing(parameters.believing({i: learned}))
     return objective
 
 

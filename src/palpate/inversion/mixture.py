@@ -252,17 +252,17 @@ def _laplace(
     if not np.isfinite(there.value):
         return None
     parameters = own.parameters
-    determinants = sum(of.log_determinant for of in parameters.priors) - log_det(there.matrix) - _beyond(there, bounds)
+    beyond = beyond_bounds(there.covariance_columns(n)[:n], bounds)
+    determinants = sum(of.log_determinant for of in parameters.priors) - log_det(there.matrix) - beyond
     room = parameters.volume
     added = 0.0 if room is None else room.at(room.of(minimum.unknowns))[0]
     level = of.log_prior + of.several + 0.5 * determinants - (there.value - added)
     return _Laplace(of, minimum, parameters.volume, level)
 
 
-def _beyond(there: Evaluation, bounds: Bounds) -> float:
-    """Sum of ln of by how much variances of theta are more than bounds leave: 1/12 of the square of their distance."""
-    n, room = len(bounds.lower), bounds.room / np.sqrt(12.0)
-    covariance = there.covariance_columns(n)[:n]
+def beyond_bounds(covariance: NDArray[np.float64], bounds: Bounds) -> float:
+    """Sum of ln of by how much variances (n, n) of theta are more than bounds leave, 1/12 of their distance squared."""
+    room = bounds.room / np.sqrt(12.0)
     seen = np.isfinite(np.diag(covariance)) & (room > 0.0)
     variances = np.linalg.eigvalsh((covariance / np.outer(*(np.where(seen, room, 1.0),) * 2))[np.ix_(seen, seen)])
     return float(np.log(np.maximum(variances, 1.0)).sum())
@@ -447,11 +447,13 @@ class LinearEvidence:
     def _of_scenario(self, scenario: Alternatives, most: int) -> list[tuple[float, Callable[[], _Compared]]]:
         """Its likeliest explanation, and those seen beside it, `most` at most: evidence, and what finds the minimum."""
         parameters, shared = self.parameters.choosing(dict(scenario.chosen)), self.shared
-        prior, centre = parameters.prior_matrix.block(shared, shared), parameters.prior_centre[shared]
-        n, chosen = parameters.n_parameters, dict(scenario.chosen)
+        prior, n = parameters.prior_matrix.block(shared, shared), parameters.n_parameters
+        chosen = dict(scenario.chosen)
         images = [[of for of in image if of.frame.items() <= chosen.items()] for image in self.images]
-        own = 0.5 * (log_det(Arrowhead.of(prior[n:, n:])) - float(centre @ prior @ centre)) + scenario.log_odds
-        information, pull = self.information + prior, self.pull + prior @ centre
+        believed, centre = parameters.prior_of_blocks.block(shared, shared), parameters.prior_centre[shared]
+        own = 0.5 * (log_det(Arrowhead.of(believed[n:, n:])) - float(centre @ believed @ centre)) + scenario.log_odds
+        own -= parameters.earlier_constant
+        information, pull = self.information + prior, self.pull + parameters.prior_pull[shared]
 
         def evidence(numbers: Sequence[int], k: int | None = None) -> list[float]:
             """The log-evidence of alternatives by their number in each image, of all those of image k in its place."""

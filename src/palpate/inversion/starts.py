@@ -94,7 +94,8 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
     shown = with_scales(with_correlations(objective, fitted.evaluation), fitted.evaluation)
     states = [replace(of, observed=own.observed) for of, own in zip(shown.states, states, strict=True)]
     evaluation = replace(objective, states=tuple(states))(fitted.unknowns)
-    data, columns = evaluation.matrix - evaluation.prior, [parameters.columns(i) for i in range(len(parameters.blocks))]
+    columns = [parameters.columns(i) for i in range(len(parameters.blocks))]
+    data = evaluation.matrix - still.prior_of_blocks  # what earlier images tell, too
     middle, evaluations = fitted.unknowns, fitted.evaluations + 1
     # free the large derivatives of everything observed by all unknowns
     del objective, shown, states, state, fitted, evaluation
@@ -102,8 +103,7 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
     bases = _combinations(parameters.blocks, informations, [state.model for state in start.states])
     fit = [inverse @ middle[own] for own, (_, inverse) in zip(columns, bases, strict=True)]
     unknowns = np.concatenate([theta, *fit])
-    blocks = tuple(b.combined(inverse) for b, (_, inverse) in zip(parameters.blocks, bases, strict=True))
-    seen, informed = replace(parameters, blocks=blocks, priors=()), list[LaterState]()
+    seen, informed = parameters.combined([inverse for _, inverse in bases]), list[LaterState]()
     made = list[_Made]()
     progress(f"how the responses to the {seen.n_coefficients} unknowns that the images show change with the moduli")
     for s, (state, q) in enumerate(zip(start.states, seen.coefficients(unknowns), strict=True)):
@@ -265,7 +265,8 @@ def informed_combinations(
     Poisson's ratios have a tissue each. Several informations are those of a motion in several images: combinations are
     then the eigenvectors for the mean, and so many that for none of them more is left out.
     """
-    if not block.terms and block.choice not in (Choice.FRAME, Choice.PATCHINESS):
+    motion = block.terms or block.acts is Acts.REFERENCE
+    if not motion and block.choice not in (Choice.FRAME, Choice.PATCHINESS):
         return np.eye(block.size), np.eye(block.size)
     root = linalg.cholesky(block.widest, lower=True)
     of_images = [root.T @ information @ root for information in informations]

@@ -9,7 +9,7 @@ from typing import Any
 
 from palpate.report.ticks import log_marks, mark_text
 from palpate.report.units import ModulusUnit, shown_unit
-from palpate.uncertainty import NORMAL_95, Interval
+from palpate.uncertainty import EARLIER, NORMAL_95, Interval
 from palpate.unknowns import FIELD, KNOWN_MODULUS, PATCHINESS
 
 NONE = "–"
@@ -27,6 +27,7 @@ CAUSES = {
     "poisson": "Poisson's ratios",
     "instrument": "the instruments' offsets",
     KNOWN_MODULUS: "the range of the known modulus",
+    EARLIER: "what earlier images left open",
     "minima": "several minima",
     "prior": "what is believed of parameters",
     "grid": "the voxels' place",

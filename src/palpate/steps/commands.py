@@ -11,6 +11,7 @@ from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image
 from palpate.progress import Line, Wanted
+from palpate.steps.adding import estimate_added
 from palpate.steps.display import shown_in_python
 from palpate.steps.previewing import checked_with_page, new_case_with_page, place_page, refuse_other_page
 from palpate.steps.results import CaseResult, SavedResult
@@ -136,22 +137,29 @@ def estimate(
     *,
     samples: int | None = None,
     truth: Mapping[str, float] | None = None,
+    add: Sequence[PathLike] = (),
+    earlier: PathLike = "palpate-output",
     progress: Wanted = "auto",
 ) -> CaseResult:
     """The Young's modulus of every `estimate` tissue of a case, with its interval and its verdict.
 
     samples: draws of the moduli's posterior, 100 to 100 000 (extra `samples`), in the place of the case's own
     [estimate] samples; truth: true moduli (kPa) by tissue, to stand beside the estimates of a
-    simulation; a phantom brings its own; progress: "auto" shows stages with a bar in a notebook and on a terminal, True
-    everywhere, None or False nowhere; a function is called with each sentence. Raises as `make_mesh` does,
-    `ConfigurationError` for another number of samples, `ResourceError` where the libraries for them are not installed,
-    and `EstimationError` where there is no result; an iteration that did not converge is a result whose status says so,
-    without values.
+    simulation; a phantom brings its own; add: later images that are added to the result of the case in the folder
+    `earlier`, at the price of these images alone; progress: "auto" shows stages with a bar in a notebook and on a
+    terminal, True everywhere, None or False nowhere; a function is called with each sentence. Raises as `make_mesh`
+    does, `ConfigurationError` for another number of samples or another case than that of the folder, `ResourceError`
+    where the libraries for samples are not installed, and `EstimationError` where there is no result; an iteration that
+    did not converge is a result whose status says so, without values.
     """
     if samples is not None:
         case = replace(case, estimate=replace(case.estimate, samples=samples))
     with shown_in_python(progress) as tell:
-        found = run.estimate(case, progress=tell, truth=truth)
+        if add:
+            images = [Path(path) for path in add]
+            found = estimate_added(case, images, Path(earlier), progress=tell, truth=truth)
+        else:
+            found = run.estimate(case, progress=tell, truth=truth)
     return CaseResult(**{field.name: getattr(found, field.name) for field in fields(found)})
 
 

@@ -33,7 +33,7 @@ def save_estimate(result: CaseResult, outputs: OutputFolder, *, progress: Progre
     with outputs.staged() as staging:
         write_estimate_files(result, staging.area)
         _draw(lambda: report.write_case_report(result, staging.area), staging, document)
-        _commit_estimate(staging, result.case, document)
+        _commit_estimate(staging, result.whole_case, document)
     return document
 
 

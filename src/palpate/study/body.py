@@ -90,11 +90,12 @@ class Body:
         return ImagedBody(self.space, states.before, states.after, self.smoothing_mm, stated_noise)
 
 
-def make_body(states: ImagedStates, case: Case, *, progress: Progress) -> Body:
-    """Mesh the reference state of the images (see `mesh_reference`); raises as that does."""
+def make_body(states: ImagedStates, case: Case, *, progress: Progress, mesh: TetMesh | None = None) -> Body:
+    """Mesh the reference state of the images (see `mesh_reference`), unless a `mesh` is given; raises as that does."""
     element = choose_element(case.mechanics.element).space
-    if states.mesh is not None:
-        found = ReferenceMesh(states.mesh, mesh_figures(states.mesh))
+    known = states.mesh if mesh is None else replace(mesh, tissues=states.before.tissues)
+    if known is not None:
+        found = ReferenceMesh(known, mesh_figures(known))
     else:
         found = mesh_reference(states.before, states.after, case, progress=progress)
     space = lagrange_space(found.mesh, element)
@@ -160,10 +161,11 @@ def inverse_problem(body: Body, case: Case, *, progress: Progress) -> InversePro
     return joint_problem((body,), case, progress=progress)
 
 
-def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> InverseProblem:
+def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress, earlier: int = 0) -> InverseProblem:
     """The same of several reference states of one patient: one set of moduli, the bodies' images one after the other.
 
-    All bodies have the same tissues in the same order. Raises as `inverse_problem` does.
+    All bodies have the same tissues in the same order. earlier: number of images that are compared with the reference
+    besides. Raises as `inverse_problem` does.
     """
     shared = tuple(layer for layer in bodies[0].layers if all(layer in body.layers for body in bodies))
     bodies = [body if body.layers == shared else _remade(body, case, layers=shared) for body in bodies]
@@ -184,7 +186,7 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress) -> 
         raise ConfigurationError(NOTHING_MOVES)  # at rest every modulus explains the images equally badly
     strained = [body.strained for body in bodies for _ in range(body.states.n_later)]
     finite = _finite_strain(models, strained, case)
-    drawn = _drawn_at_rest(seen)
+    drawn = _drawn_at_rest(seen, earlier)
     states = tuple(
         LaterState(model, observations, law, reference, at_rest={of.name: of.modes for of in drawn if s in of.states})
         for s, (model, law, (reference, observations)) in enumerate(zip(models, finite, seen, strict=True))
@@ -258,7 +260,7 @@ class _DrawnAtRest(NamedTuple):
     covariances: tuple[NDArray[np.float64], ...]
 
 
-def _drawn_at_rest(seen: Sequence[tuple[int, tuple[Observation, ...]]]) -> tuple[_DrawnAtRest, ...]:
+def _drawn_at_rest(seen: Sequence[tuple[int, tuple[Observation, ...]]], earlier: int) -> tuple[_DrawnAtRest, ...]:
     """Those of all references; of a single later image, and of a wall that moves freely, the noise says as much."""
     found = dict[tuple[int, str], list[tuple[int, SurfaceDistance]]]()
     for s, (reference, observed) in enumerate(seen):
@@ -268,7 +270,7 @@ def _drawn_at_rest(seen: Sequence[tuple[int, tuple[Observation, ...]]]) -> tuple
     return tuple(
         _DrawnAtRest(name, tuple(s for s, _ in of), *modes_at_rest(of[0][1].target.surface))
         for (_, name), of in found.items()
-        if len(of) > 1
+        if len(of) + earlier > 1
     )
 
 

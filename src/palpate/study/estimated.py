@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.findings import Finding
+from palpate.inversion import EarlierImages
 from palpate.observation.contract import Fit, PointMotions
 from palpate.study.discrepancy import FittedMaterial, FoundDiscrepancy
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate
@@ -138,6 +139,7 @@ class Estimation:
     image_pairs: what each of several later images says alone; samples: of the moduli's posterior,
     where the case asks for them and the estimate converged; variations: what would change the answer; maps: of tissues
     whose modulus is a field; materials: of the elements, one for each later state;
+    images: what they tell, for others that are added;
     explanations: the likelier ones of those of which the posterior is a mixture.
     """
 
@@ -166,6 +168,7 @@ class Estimation:
     variations: tuple[Variation, ...] = ()
     maps: tuple[StiffnessMap, ...] = ()
     materials: tuple[FittedMaterial, ...] = ()
+    images: EarlierImages | None = None
     explanations: tuple[StatedExplanation, ...] = ()
 
     @property

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from palpate.images.checks import later_names
 from palpate.inversion import (
+    EarlierImages,
     Inversion,
     InversionSettings,
     Iterate,
     Linearisation,
     StartRun,
+    earlier_images,
 )
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, seen_by
@@ -38,7 +40,9 @@ from palpate.study.variations import Variation
 from palpate.study.verdicts import IDENTIFIED, estimates_of, intervals_of
 from palpate.uncertainty import (
     GRID_DRAWS,
+    Covariance,
     FittedState,
+    correlated_factor,
     covariance_of,
     grid_errors,
     information,
@@ -145,7 +149,24 @@ def conclude(
         explanations=_explanations(inversion) if minimum.converged else (),
         materials=fitted_materials(inversion),
         variations=variations,
+        images=_told(inversion, settings, own) if known and all(None not in of.interval for of in known) else None,
     )
+
+
+def _told(inversion: Inversion, settings: InversionSettings, own: Covariance) -> EarlierImages | None:
+    """What the images tell, for others that are added; None where that is no law.
+
+    With the errors that the posterior leaves out, but the mesh's, which added images share. It is not asked of a
+    posterior with an open end, which is far from normal: added images would be held where nothing tells a modulus.
+    """
+    parameters, n_images = inversion.objective.parameters, len(inversion.objective.states)
+    wider, beside = correlated_factor(inversion.mixture, own), own.of_held + own.grid
+    seen = np.isfinite(wider) & np.isfinite(np.diag(beside))  # a modulus that moves nothing has no errors
+    errors = {"wider": np.where(seen, wider, 1.0), "beside": np.where(np.outer(seen, seen), beside, 0.0)}
+    try:
+        return earlier_images(inversion.mixture, parameters, settings.bounds, n_images=n_images, **errors)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def _reason(inversion: Inversion) -> str:

@@ -33,9 +33,11 @@ ASIDE = ".earlier"  # behind the name of a file that is set aside
 LARGEST_DOCUMENT = 2**26  # bytes of a JSON document that is read
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 RESULT, PAGE, DATA = "result.json", "report.html", "report-data.npz"  # the document of an estimate, and its report
+KNOWN_IMAGES = "known-images.npz"  # what its images tell, for others that are added
 RESULT_FILES = (  # what else an estimate writes, with its case
     DATA,
     PAGE,
+    KNOWN_IMAGES,
     "labels.csv",
     "labels.nii.gz",
     "mesh.vtu",

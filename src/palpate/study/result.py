@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from palpate.study.case_tissue import CaseTissue
 from palpate.study.discrepancy import FoundDiscrepancy
 from palpate.study.edge_length import EdgeLength
 from palpate.study.estimated import Estimation, ModulusEstimate, StatedExplanation, no_estimate
+from palpate.study.known_images import BuiltOn, KnownImages
 from palpate.study.map_words import map_words
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
 from palpate.study.provenance import image_names
@@ -90,6 +91,8 @@ class CaseResult:
     space: the displacements' points on the mesh of the reference state; before, after: segmentations, the later ones
     brought to the first (aligned), all in RAS mm; remarks: those of the study, beside the estimation's own;
     note: a sentence that must stand wherever the numbers are shown (of what a demo simulates, say);
+    known: what its images tell, for others that are added, None where none may be; built_on: the estimate that they
+    were added to, the case is then that of the added images;
     further: the pairs after the first. The estimation's fits and displacements are those of `after`, then theirs;
     alignments: how each of `after` lay in its own image; empty where nothing was aligned.
     """
@@ -105,6 +108,13 @@ class CaseResult:
     note: str = ""
     further: tuple[PairResult, ...] = ()
     alignments: tuple[Registration, ...] = ()
+    known: KnownImages | None = None
+    built_on: BuiltOn | None = None
+
+    @property
+    def whole_case(self) -> Case:
+        """The case with all later images, those that were seen before among them."""
+        return self.built_on.case if self.built_on else self.case
 
     @property
     def tissues(self) -> tuple[Tissue, ...]:
@@ -167,6 +177,9 @@ class CaseResult:
         each = zip(names, pairs.alone if pairs else (), strict=False)
         alone = [{"after": name} | _plain(pair) for name, pair in each]
         drawn = estimation.samples if estimation.status == "converged" else None
+        provenance = self.provenance
+        if self.built_on:
+            provenance = replace(provenance, inputs=self.built_on.every_input(provenance.inputs))
         document = _heading(self.case, estimation.status, estimation.reason) | {
             "estimates": [
                 *(_estimate(item, estimation.status) for item in estimation.estimates),
@@ -180,6 +193,7 @@ class CaseResult:
             "combinations": [_plain(pair) for pair in estimation.combinations],
             "regions": [_plain(region) for region in estimation.regions],
             "image_pairs": pairs and _plain(pairs) | {"alone": alone},
+            "built_on": self.built_on and self.built_on.to_dict(),
             "explanations": [
                 _explanation(of, names) for of in (estimation.explanations if estimation.status == "converged" else ())
             ],
@@ -222,7 +236,7 @@ class CaseResult:
         }
         if self.further:
             document |= {"pairs": [{"mesh": _plain(pair.mesh_summary)} for pair in self.further]}
-        return json_object(document | closing(self.case, self.provenance, self.all_remarks) | {"note": self.note})
+        return json_object(document | closing(self.whole_case, provenance, self.all_remarks) | {"note": self.note})
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,6 +319,7 @@ def failure_document(case: Case, error: PalpateError) -> dict[str, Any]:
         "combinations": [],
         "regions": [],
         "image_pairs": None,
+        "built_on": None,
         "explanations": [],
         "samples": None,
         "alignment": [],

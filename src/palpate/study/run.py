@@ -25,6 +25,7 @@ from palpate.study.estimated import Estimation
 from palpate.study.estimation import Observed, conclude
 from palpate.study.imaged import ImagedStates
 from palpate.study.inverted import inverted
+from palpate.study.known_images import Added, KnownImages, why_together
 from palpate.study.plausibility import estimate_warnings, unit_warnings
 from palpate.study.poisson_ratios import with_ratios
 from palpate.study.provenance import image_names, input_digests, software_versions
@@ -45,11 +46,13 @@ def estimate(
     progress: Progress = silent,
     truth: Mapping[str, float] | None = None,
     condition: Callable[[ExpectedCost], None] | None = None,
+    added: Added | None = None,
 ) -> CaseResult:
     """Estimate the Young's modulus of every `estimate` tissue of a case, from its images or its phantom.
 
     `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own;
-    `condition`: is asked with what is expected to be taken, once the images are read, and may raise.
+    `condition`: is asked with what is expected to be taken, once the images are read, and may raise; `added`: to which
+    earlier estimate the case's later images are added.
     Raises `ResourceError` where this machine has not the memory, `PalpateError`s of reading, meshing and solving; an
     iteration that did not converge is no error but a result whose status says so, with no values.
     """
@@ -58,6 +61,8 @@ def estimate(
     reading("reading and aligning the images")
     images = read_case_images(case, progress=reading)
     progress(Line(_in_words(images.pairs), "read"))
+    if added is not None:
+        added.built_on.refuse_other_images(images.inputs)
     states, *further = images.pairs
     cost = expected_cost(case, states.before, states.after, n_pairs=len(images.pairs), mesh=states.mesh)
     refuse_lack(cost)
@@ -68,7 +73,9 @@ def estimate(
         stated = [(t.name, t.youngs_modulus_kpa) for t in states.before.tissues if t.role is Role.ESTIMATE]
         truth = {name: value for name, value in stated if value is not None}
     seconds = time.perf_counter() - began
-    result = estimate_states(states, case, progress=progress, truth=truth, read_seconds=seconds, further=tuple(further))
+    result = estimate_states(
+        states, case, progress=progress, truth=truth, read_seconds=seconds, further=tuple(further), added=added
+    )
     return replace(result, provenance=replace(result.provenance, inputs=images.inputs))
 
 
@@ -81,23 +88,26 @@ def estimate_states(
     truth: Mapping[str, float] | None = None,
     read_seconds: float = 0.0,
     further: tuple[ImagedStates, ...] = (),
+    added: Added | None = None,
 ) -> CaseResult:
     """The same from states that are already read and aligned; the case gives the settings.
 
     `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; `further`: pairs of the same
-    body, each with its own reference state, which are meshed on their own and share the moduli.
+    body, each with its own reference state, which are meshed on their own and share the moduli; `added`: as above.
     """
-    clock = [time.perf_counter()]
-    bodies = tuple(make_body(pair, case, progress=during("mesh", progress)) for pair in (states, *further))
-    body = bodies[0]
+    clock, mesh = [time.perf_counter()], added.mesh if added else None
+    bodies = tuple(make_body(pair, case, progress=during("mesh", progress), mesh=mesh) for pair in (states, *further))
+    body, earlier = bodies[0], added.built_on.images if added else 0
     cost = cost_of_bodies(bodies, case)
     refuse_lack(cost)
     progress(_forecast(cost))
     clock.append(time.perf_counter())
     progress(Line(f"the equations of {counted(cost.unknowns, 'unknown')}", "assemble"))
-    problem = joint_problem(bodies, case, progress=during("assemble", progress))
-    clock.append(time.perf_counter())
+    problem = joint_problem(bodies, case, progress=during("assemble", progress), earlier=earlier)
     settings = inversion_settings(case, problem.parameters)
+    if added:
+        problem, settings = added.known.problem_with(problem, case), added.settings(settings)
+    clock.append(time.perf_counter())
     later = "later image" if len(problem.states) == 1 else "later images"
     progress(Line(f"the moduli that explain the {later}, from {counted(len(settings.every_start), 'start')}", "search"))
     inversion = inverted(bodies, problem, case, settings, progress=progress)
@@ -106,7 +116,9 @@ def estimate_states(
     stating = during("intervals", progress)
 
     def vary(posterior: StatedPosterior) -> tuple[Variation, ...]:
-        """What would change the answer."""
+        """What would change the answer; with added images what the earlier ones would tell then is not known."""
+        if added:
+            return ()
         stating("what would change the answer: surfaces, constants, frame and law, one after the other")
         return _what_would_change(inversion, settings, case, bodies, posterior)
 
@@ -120,6 +132,9 @@ def estimate_states(
         vary=vary,
         progress=stating,
     )
+    known, n_images = None, earlier + len(problem.states)
+    if estimation.images and not why_together(case, n_images):
+        known = KnownImages.of(replace(estimation.images, n_images=n_images), problem, case)
     clock.append(time.perf_counter())
     stages = np.diff(clock)
     seconds = {"read": read_seconds, "mesh": stages[0], "assemble": stages[1], "estimate": stages[2]}
@@ -138,7 +153,10 @@ def estimate_states(
             *estimate_warnings(case, estimation),
         ),
         further=_further(bodies, estimation),
+        note=added.built_on.sentence(len(problem.states)) if added else "",
         alignments=states.alignments,
+        known=known,
+        built_on=added.built_on if added else None,
     )
 
 

@@ -5,6 +5,7 @@ from palpate.uncertainty.combinations import Information as Information
 from palpate.uncertainty.combinations import information as information
 from palpate.uncertainty.combinations import information_shares as information_shares
 from palpate.uncertainty.combinations import known_pairs as known_pairs
+from palpate.uncertainty.covariance import EARLIER as EARLIER
 from palpate.uncertainty.covariance import GRID_DRAWS as GRID_DRAWS
 from palpate.uncertainty.covariance import Covariance as Covariance
 from palpate.uncertainty.covariance import FittedState as FittedState
@@ -30,6 +31,7 @@ from palpate.uncertainty.intervals import log_interval as log_interval
 from palpate.uncertainty.intervals import modulus_interval as modulus_interval
 from palpate.uncertainty.marginals import Marginal as Marginal
 from palpate.uncertainty.marginals import StatedMixture as StatedMixture
+from palpate.uncertainty.marginals import correlated_factor as correlated_factor
 from palpate.uncertainty.marginals import marginals_of as marginals_of
 from palpate.uncertainty.marginals import stated_mixture as stated_mixture
 from palpate.uncertainty.profile import JointRegion as JointRegion

@@ -28,6 +28,7 @@ GridErrors = Sequence[Sequence[NDArray[np.float64]]]
 """Errors (n,) mm of the residuals of each observation, of each draw of a grid."""
 
 GRID_DRAWS = 8
+EARLIER = "earlier"  # the cause of errors that earlier images have left
 ROUNDING = 1e-6  # share of a variance that is only rounding, as of blocks that are held
 TOLD = 1e-3  # share of the images in what is known of a combination, below which the fit takes no errors for it
 MARGIN_MM, MARGIN_VOXELS = 12.0, 8.0  # of the grid around the residuals' places, wider than the maps' smoothing
@@ -82,6 +83,11 @@ class Covariance:
     def total(self) -> NDArray[np.float64]:
         """The sum of all causes."""
         return self.noise + self.prior + self.grid + self.mesh
+
+    @property
+    def of_held(self) -> NDArray[np.float64]:
+        """That by all blocks that are held."""
+        return sum(self.held.values(), np.zeros_like(self.prior))
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -140,11 +146,13 @@ def covariance_of(
     held = _held(objective, evaluation, rows)
     causes, prior = dict(held), prior + sum(held.values(), np.zeros_like(prior))
     left = (noise, prior, grid) if given is evaluation else parts(1)
-    inverse = rows.T
-    for i, block in enumerate(objective.parameters.blocks):
-        own = objective.parameters.columns(i)
-        part = inverse[own].T @ evaluation.prior.block(own, own) @ inverse[own]
+    inverse, parameters = rows.T, objective.parameters
+    for i, block in enumerate(parameters.blocks):
+        own = parameters.columns(i)
+        part = inverse[own].T @ parameters.prior_of_blocks.block(own, own) @ inverse[own]
         causes[block.cause] = causes.get(block.cause, np.zeros_like(part)) + part
+    if parameters.earlier:
+        causes[EARLIER] = np.asarray(rows @ ((evaluation.prior - parameters.prior_of_blocks) @ inverse))
     padded = np.pad(mesh, (0, len(numbers) - n))
     return Covariance(noise, prior, grid, padded, causes, held, sum(left, mesh))
 

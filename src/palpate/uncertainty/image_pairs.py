@@ -152,7 +152,7 @@ def _noise_and_prior(objective: Objective, alone: Sequence[Minimum]) -> tuple[ND
             placed = np.zeros((size, rows.shape[1]))
             placed[columns] = rows
             pairs.append((replace(term, state=s), placed))
-    return noise_covariance(objective, pairs, noise), np.asarray(answers.T @ (mapping.prior_matrix @ answers))
+    return noise_covariance(objective, pairs, noise), np.asarray(answers.T @ (mapping.prior_of_blocks @ answers))
 
 
 def agreement(pairs: PairEstimates) -> Agreement:

@@ -50,9 +50,8 @@ def stated_mixture(mixture: Mixture, own: Covariance, blocks: tuple[Block, ...])
     within explanations and that between their means (law of total variance). By how much it is larger than that of the
     likeliest one is told by what distinguishes them.
     """
-    first, held = mixture.explanations[0], sum(own.held.values(), np.zeros_like(own.prior))
-    sandwich, posterior = own.noise + own.prior - held, np.diag(first.covariance)
-    factor = np.clip(np.sqrt(np.diag(sandwich) / posterior), 1.0, CORRELATED)
+    held, factor = own.of_held, correlated_factor(mixture, own)
+    sandwich = own.noise + own.prior - held
     every = np.stack([np.outer(factor, factor) * of.covariance for of in mixture.explanations])
     weights, theta = mixture.weights, np.stack([of.theta for of in mixture.explanations])
     within, away = np.tensordot(weights, every, axes=1), theta - mixture.mean
@@ -73,6 +72,12 @@ def stated_mixture(mixture: Mixture, own: Covariance, blocks: tuple[Block, ...])
     prior = within + apart + held - noise
     whole = replace(own, noise=noise, prior=prior, causes=causes)
     return StatedMixture(weights, theta, every + known, whole)
+
+
+def correlated_factor(mixture: Mixture, own: Covariance) -> NDArray[np.float64]:
+    """The factor (n,) on each standard deviation, 1 to `CORRELATED`, by residuals that are alike over surfaces."""
+    sandwich = np.diag(own.noise + own.prior - own.of_held)
+    return np.clip(np.sqrt(sandwich / np.diag(mixture.explanations[0].covariance)), 1.0, CORRELATED)
 
 
 def _groups(mixture: Mixture, blocks: tuple[Block, ...]) -> Mapping[str, NDArray[np.float64]]:

@@ -75,11 +75,15 @@ class Choice(Enum):
 
 @dataclass(frozen=True)
 class Alternative:
-    """One prior N(0, covariance (n, n)) of a block, its log prior odds, and its name for a reader."""
+    """One prior N(0, covariance (n, n)) of a block, its log prior odds, and its name for a reader.
+
+    variances: of the block's terms, where they were learned.
+    """
 
     covariance: NDArray[np.float64]
     log_odds: float = 0.0
     name: str = ""
+    variances: tuple[float, ...] = ()
 
     @cached_property
     def precision(self) -> NDArray[np.float64]:
@@ -101,8 +105,9 @@ class Block:
     sum_t a_t^2 C_t with amplitudes a_t that are learned once, none where it is not; unit_mm: what a coefficient of 1 is
     worth where it is a motion; regions: numbers of the model's regions whose moduli it multiplies, one unknown x for
     all of them, where it acts on moduli: a `share` s of each, in series with the rest of it, is e^x times as stiff, and
-    the whole 1 / (1 + s (e^-x - 1)) times; mean (n,): of its priors, 0 where it is empty. Raises `ConfigurationError`
-    for covariances of different sizes.
+    the whole 1 / (1 + s (e^-x - 1)) times; mean (n,): of its priors, 0 where it is empty; rows (n, m): of which m
+    unknowns its own are combinations; None: of themselves. Raises `ConfigurationError` for covariances of different
+    sizes.
     """
 
     of: str
@@ -116,6 +121,7 @@ class Block:
     regions: tuple[int, ...] = ()
     share: float = 1.0
     mean: tuple[float, ...] = ()
+    rows: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.alternatives[0].covariance),) * 2
@@ -171,7 +177,14 @@ class Block:
 
         alternatives = tuple(replace(each, covariance=of(each.covariance)) for each in self.alternatives)
         mean = tuple((inverse @ self.mean).tolist()) if self.mean else ()
-        return replace(self, alternatives=alternatives, terms=tuple(map(of, self.terms)), mean=mean)
+        rows = inverse if self.rows is None else inverse @ self.rows
+        return replace(self, alternatives=alternatives, terms=tuple(map(of, self.terms)), mean=mean, rows=rows)
+
+    def with_variances(self, variances: Sequence[float]) -> Block:
+        """The block whose terms have these variances, and are learned no more."""
+        every = [term + LEAST_VARIANCE * np.eye(self.size) for term in self.terms]
+        known = Alternative(np.tensordot(variances, np.stack(every), axes=1), variances=tuple(variances))
+        return replace(self, alternatives=(known,), terms=())
 
 
 def only(covariance: NDArray[np.float64]) -> tuple[Alternative, ...]:

@@ -15,6 +15,7 @@ from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
 from palpate.unknowns.arrowhead import Arrowhead, Places
 from palpate.unknowns.blocks import KNOWN_MODULUS, Acts, Alternative, Block, in_series, in_series_slopes
+from palpate.unknowns.likelihood import Likelihood
 
 LOADS = "the known loads"
 LEVELS_OFF = 1.5  # of ln E: distance from a place at which the room that theta leaves all others levels off
@@ -97,7 +98,10 @@ class ParameterMap:
     The prior is normal: theta with `prior_mean` (n_parameters,) and `prior_precision` (n_parameters, n_parameters),
     flat by default, the blocks' unknowns with their means and one of the `priors` for each block, by default what the
     blocks believe. `volume`: what integrating over the blocks' unknowns adds to J as a function of theta; None:
-    nothing, the blocks' unknowns are sought. Raises `ConfigurationError` for a prior of another shape.
+    nothing, the blocks' unknowns are sought. `earlier`: what images that are not among the later states say of the
+    `shared` unknowns, under every scenario, by its `levels`: of each block that a scenario decides the number of its
+    alternative, in order; that of the map's own levels counts as a prior. Raises `ConfigurationError` for a prior of
+    another shape.
     """
 
     base: NDArray[np.float64]
@@ -110,6 +114,8 @@ class ParameterMap:
     prior_precision: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     priors: tuple[Alternative, ...] = ()
     volume: Volume | None = None
+    earlier: Mapping[tuple[int, ...], Likelihood] = field(default_factory=dict, repr=False)
+    levels: tuple[int, ...] = ()
     _layout: _Layout = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -123,6 +129,7 @@ class ParameterMap:
                 raise ConfigurationError(f"{name} has the shape {given.shape}; {n} parameters need {shape}")
         if not self.priors:
             object.__setattr__(self, "priors", tuple(block.begins for block in self.blocks))
+            object.__setattr__(self, "levels", tuple(self.blocks[i].first for i in self._of_tissues))
         sizes = [[len(of.covariance) for of in self.priors], [block.size for block in self.blocks]]
         if sizes[0] != sizes[1]:
             raise ConfigurationError(f"the priors are of {sizes[0]} unknowns, the blocks have {sizes[1]}")
@@ -180,22 +187,61 @@ class ParameterMap:
         """Numbers (n,) of the unknowns that act so in a later state, in the order of the blocks."""
         return self._layout.acting.get((acts, state), np.zeros(0, dtype=np.int64))
 
+    @property
+    def shared(self) -> NDArray[np.int64]:
+        """Numbers (n,) of theta and of the blocks of the body, which another later image would have, too."""
+        body = [self.columns(i) for i in self.body_blocks]
+        return np.concatenate([np.arange(self.n_parameters), *body])
+
+    @property
+    def body_blocks(self) -> list[int]:
+        """Numbers of the blocks of the body, which no single image has for itself."""
+        own = {i for state in range(self.n_states) for i in self.blocks_of_image(state)}
+        return [i for i in range(len(self.blocks)) if i not in own]
+
+    @property
+    def _of_tissues(self) -> list[int]:
+        return [i for i, block in enumerate(self.blocks) if block.choice.of_tissues]
+
     @cached_property
-    def prior_matrix(self) -> Arrowhead:
-        """Precision P of all unknowns before the images are seen."""
+    def prior_of_blocks(self) -> Arrowhead:
+        """Precision of all unknowns before any image is seen."""
         of_blocks = [(place, of.precision) for place, of in zip(self._layout.blocks, self.priors, strict=True)]
         return Arrowhead.zeros(self.places).plus([(np.arange(self.n_parameters), self.prior_precision), *of_blocks])
 
+    @cached_property
+    def prior_matrix(self) -> Arrowhead:
+        """Precision P of all unknowns before the images are seen, but the earlier ones."""
+        earlier = self.earlier.get(self.levels)
+        return self.prior_of_blocks.plus([(self.shared, earlier.matrix)]) if earlier else self.prior_of_blocks
+
+    @property
+    def prior_pull(self) -> NDArray[np.float64]:
+        """P m (n_unknowns,), m where the prior is largest."""
+        pull, earlier = self.prior_of_blocks @ self.prior_centre, self.earlier.get(self.levels)
+        if earlier:
+            pull[self.shared] += earlier.pull
+        return pull
+
+    @property
+    def earlier_constant(self) -> float:
+        """The constant of what the earlier images say; 0 without any."""
+        earlier = self.earlier.get(self.levels)
+        return earlier.constant if earlier else 0.0
+
     @property
     def prior_centre(self) -> NDArray[np.float64]:
-        """Mean (n_unknowns,) of all unknowns before the images are seen."""
+        """Mean (n_unknowns,) of all unknowns before any image is seen."""
         return np.concatenate([self.prior_mean, *(block.mean or np.zeros(block.size) for block in self.blocks)])
 
     def prior(self, unknowns: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """1/2 (x - m)^T P (x - m) + v(theta), v the `volume`, at unknowns x (n_unknowns,); gradient (n_unknowns,)."""
         away, n = unknowns - self.prior_centre, self.n_parameters
-        pull = self.prior_matrix @ away
+        pull = self.prior_of_blocks @ away
         value = 0.5 * float(away @ pull)
+        if earlier := self.earlier.get(self.levels):
+            told, by = earlier.at(unknowns[self.shared])
+            value, pull[self.shared] = value + told, pull[self.shared] + by
         if self.volume is not None:
             added, slope = self.volume.at(self.volume.of(unknowns))
             value, pull[:n] = value + added, pull[:n] + slope[:n]
@@ -280,14 +326,16 @@ class ParameterMap:
         return np.pad(moved, ((0, 0), (0, n_offsets)))
 
     def alone(self, state: int) -> tuple[ParameterMap, NDArray[np.int64]]:
-        """The map of one later state alone, and the numbers (n_own,) of its unknowns among all."""
+        """The map of one later state alone, without earlier images, and the numbers (n_own,) of its unknowns."""
         kept = [i for i, block in enumerate(self.blocks) if state in block.states]
         blocks = tuple(replace(self.blocks[i], states=(0,)) for i in kept)
         own = np.concatenate([np.arange(self.n_parameters), *(self.columns(i) for i in kept)])
         share = self.volume
         if share is not None:
             share = replace(share, slope=share.slope / self.n_states, numbers=np.searchsorted(own, share.numbers))
-        return replace(self, blocks=blocks, priors=tuple(self.priors[i] for i in kept), volume=share), own
+        priors = tuple(self.priors[i] for i in kept)
+        levels = tuple(level for i, level in zip(self._of_tissues, self.levels, strict=True) if i in kept)
+        return replace(self, blocks=blocks, priors=priors, volume=share, earlier={}, levels=levels), own
 
     def _model_columns(self, state: int) -> NDArray[np.int64]:
         return np.concatenate([self.acting(Acts.BOUNDARY, state), self.acting(Acts.MATERIAL, state)])
@@ -298,7 +346,23 @@ class ParameterMap:
 
     def choosing(self, chosen: Mapping[int, int]) -> ParameterMap:
         """The same with the alternative priors of blocks, by the numbers of both."""
-        return self.believing({i: self.blocks[i].alternatives[k] for i, k in chosen.items()})
+        levels = tuple(chosen.get(i, own) for i, own in zip(self._of_tissues, self.levels, strict=True))
+        return replace(self.believing({i: self.blocks[i].alternatives[k] for i, k in chosen.items()}), levels=levels)
+
+    def combined(self, inverses: Sequence[NDArray[np.float64]]) -> ParameterMap:
+        """The map of combinations z = inverse x of each block's unknowns, inverse (k, n), as believed at first.
+
+        What earlier images say of that which is left out is integrated out under each scenario.
+        """
+        blocks = tuple(block.combined(inverse) for block, inverse in zip(self.blocks, inverses, strict=True))
+        shared, found = self.body_blocks, dict[tuple[int, ...], Likelihood]()
+        rows = linalg.block_diag(np.eye(self.n_parameters), *(inverses[i] for i in shared))
+        for levels, earlier in self.earlier.items():
+            chosen = dict(zip(self._of_tissues, levels, strict=True))
+            priors = [self.blocks[i].alternatives[chosen[i]] if i in chosen else self.priors[i] for i in shared]
+            covariance = linalg.block_diag(np.eye(self.n_parameters), *(of.covariance for of in priors))
+            found[levels] = earlier.of_combinations(rows, covariance)
+        return replace(self, blocks=blocks, priors=(), earlier=found)
 
     def blocks_of_image(self, state: int) -> list[int]:
         """Numbers of the blocks of how a later image moves and is drawn, which no other image has."""
