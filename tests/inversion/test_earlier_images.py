@@ -54,7 +54,8 @@ def scenarios(mixture):
     """Probability of each scenario of the tissues."""
     found = {}
     for of in mixture.explanations:
-        found[of.scenario] = found.get(of.scenario, 0.0) + of.weight
+        tissues = of.scenario[:2]  # how the frame moves belongs to the images
+        found[tissues] = found.get(tissues, 0.0) + of.weight
     return found
 
 
