@@ -117,7 +117,7 @@ def at_finite_strain(near: Searched, *, progress: Progress) -> Searched:
         states.append(replace(state, approximation=None, bending=basis))
     objective = replace(before, states=tuple(states)).under(expansions)
     there = begun(objective, at.unknowns, history=at.history, evaluations=at.evaluations)
-    return replace(there, mixture=near.mixture)
+    return replace(there, mixture=near.mixture, group=near.group)
 
 
 @blas_on_one_thread()
