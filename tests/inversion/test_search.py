@@ -147,7 +147,7 @@ def test_convergence_is_a_property_of_where_it_ends(patients, bent, found):
     end = way(patients, begin(bent[1]))[-1]
     again = one_more(patients, replace(end, minimum=replace(end.minimum, outcome=Outcome.STEPS)))
     assert again.minimum.outcome is Outcome.CONVERGED
-    assert np.all(np.abs(again.posterior.mean - end.posterior.mean) < 0.1 * REPORTED.step_sd * sd_of(end.posterior))
+    assert np.all(np.abs(again.posterior.mean - end.posterior.mean) < REPORTED.step_sd * sd_of(end.posterior))
     anew = searched(begun(end.objective, end.minimum.unknowns), patients.WIDE, REPORTED, progress=silent, title="again")
     assert np.all(np.abs(anew.posterior.mean - found.mixture.mean) < 2.0 * REPORTED.step_sd * sd_of(found.mixture))
 

@@ -135,6 +135,14 @@ def test_a_voxel_has_the_same_tissue_in_whatever_brick_it_lies_in_holes_and_outs
         assert np.array_equal(voxelise(space, wave(space.points), part(*of)), bricks[of])
 
 
+def test_around_a_body_without_a_hollow_every_voxel_is_of_its_outer_tissue():
+    """Nothing else lies behind any face."""
+    mesh = ball_and_cavity()
+    region, beyond = np.full(len(mesh.tets), 2), np.full(len(mesh.beyond), OUTER)
+    space = lagrange_space(TetMesh(mesh.nodes, mesh.tets, region, mesh.boundary, beyond, TISSUES), "P1")
+    assert np.all(voxelise(space, np.zeros_like(space.points), grid()) == 2)
+
+
 def test_faces_that_are_laid_over_several_grids_give_what_each_gives_alone():
     space = lagrange_space(ball_and_cavity(), "P2")
     faces = DeformedFaces.of(space, wave(space.points))

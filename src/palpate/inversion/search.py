@@ -211,7 +211,8 @@ def _ended(now: Searched, mixture: Mixture, bounds: Bounds) -> Searched:
     own, held = now.frozen.believing(objective.parameters), Bounds(theta, theta)
     target = gauss_newton(own, start, bounds=held, tolerance=NEAR).unknowns
     there = _taken(replace(now, objective=objective, mixture=mixture), at.evaluation, target)
-    history = (*at.history, there.minimum.history[-1])
+    before = at.history[:-1] if np.array_equal(at.history[-1].theta, theta) else at.history  # no place stands twice
+    history = (*before, there.minimum.history[-1])
     return replace(there, minimum=replace(there.minimum, outcome=at.outcome, history=history))
 
 
@@ -262,7 +263,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         fits=now.fits + 1,
         frozen=posterior,
     )
-    if group is not None and (settled if rule.step_sd < LAST_FIT else exact) and moved < rule.step_sd:
+    if now.group is not None and exact and (settled or rule.step_sd >= LAST_FIT) and moved < rule.step_sd:
         evaluation = evaluation.under(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
         return replace(before, minimum=minimum, settled=True)

@@ -112,8 +112,9 @@ class DeformedFaces:
         Bricks of voxels are decided first, large ones before small ones. A region that is nearer to a brick's middle
         than all others, by more than the brick's diameter, is nearest for all of its voxels.
         """
-        found = np.zeros(len(voxels), dtype=np.int64)
-        left = np.arange(len(voxels)) if len(self.nearest) > 1 else np.zeros(0, dtype=np.int64)
+        found, left = np.zeros(len(voxels), dtype=np.int64), np.arange(len(voxels))
+        if len(self.nearest) == 1:
+            return np.asarray(self.behind[found])
         for size in (*BRICKS, 1):
             shape = tuple(-(-n // size) for n in grid.shape)
             brick = np.ravel_multi_index((voxels[left] // size).T, shape)
