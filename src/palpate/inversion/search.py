@@ -5,7 +5,7 @@ It is the same for the linear and for a finite-strain law, and for every approxi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -138,16 +138,19 @@ def searched(
         now = _followed(now, bounds, rule, progress=progress, title=title, begins=begins)
         if not now.minimum.converged:
             return now
-        every = [now]
+        best, every = now, [now.posterior]
         for rival in _rivals(now, bounds):
             words = f"{title}, {', '.join(word for word in rival.group or () if word)}"
             few, least = replace(rule, iterations=FOLLOWED), now.posterior.level - RIVAL
-            every.append(_followed(rival, bounds, few, progress=progress, title=words, least=least))
-        best = max(every, key=lambda each: each.posterior.level)
+            found = _followed(rival, bounds, few, progress=progress, title=words, least=least)
+            every.append(found.posterior)
+            best = max(best, found, key=lambda each: each.posterior.level)
+            if best is not now and change < CHANGES:
+                break  # the others are compared again from there
         if best is now or change == CHANGES:
             break
         now = replace(best, settled=False, fits=0, minimum=replace(best.minimum, outcome=Outcome.STEPS))
-    return _ended(now, Mixture.of(of for each in every for of in each.posterior.explanations), bounds)
+    return _ended(now, Mixture.of(of for each in every for of in each.explanations), bounds)
 
 
 def _followed(
@@ -172,8 +175,11 @@ def _followed(
     return now
 
 
-def _rivals(now: Searched, bounds: Bounds) -> list[Searched]:
-    """Where other groups of explanations are followed, those that may be likely as they are seen from its best."""
+def _rivals(now: Searched, bounds: Bounds) -> Iterator[Searched]:
+    """Where other groups of explanations are followed, those that may be likely as they are seen from its best.
+
+    One after the other: each has the derivatives of all residuals there.
+    """
     assert now.frozen is not None, "a search has come to its end"
     at, n = now.minimum, now.objective.n_parameters
     near = bounds.around(at.unknowns[:n], RADIUS)
@@ -183,16 +189,16 @@ def _rivals(now: Searched, bounds: Bounds) -> list[Searched]:
         return scenario.group != now.group
 
     if not any(map(kept, scenarios_of(now.frozen.parameters.blocks))):
-        return []
+        return
     seen = mixture_of(now.frozen, at.unknowns, at.evaluation, near, Candidates(kept, of_group=OF_RIVALS))
-    found = dict[tuple[str, ...], Searched]()
+    found = set[tuple[str, ...]]()
     for of in seen.explanations:
         if of.level > now.posterior.level - RIVAL and of.group not in found:
+            found.add(of.group)
             own = Mixture(tuple(other for other in seen.explanations if other.group == of.group))
             objective = now.objective.believing(of.prior(now.objective.parameters))
             before = replace(now, objective=objective, mixture=own, group=of.group, moved=np.inf)
-            found[of.group] = _taken(before, at.evaluation, of.minimum.unknowns)
-    return list(found.values())
+            yield _taken(before, at.evaluation, of.minimum.unknowns)
 
 
 def _ended(now: Searched, mixture: Mixture, bounds: Bounds) -> Searched:
