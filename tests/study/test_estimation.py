@@ -240,7 +240,11 @@ def of_two(inversion, *, share=0.5, away=1.0, chosen=({}, {})):
     (only,) = inversion.mixture.explanations
     other = replace(only, theta=only.theta + np.array([away, 0.0]), weight=1.0 - share, chosen=chosen[1])
     both = (replace(only, weight=share, chosen=chosen[0]), other)
-    return replace(inversion, mixture=replace(inversion.mixture, explanations=both))
+    parameters = inversion.objective.parameters
+    first, *rest = parameters.blocks
+    first = replace(first, alternatives=(first.alternatives[0],) * 2)  # what is chosen must be there
+    objective = inversion.objective.believing(replace(parameters, blocks=(first, *rest)))
+    return replace(inversion, objective=objective, mixture=replace(inversion.mixture, explanations=both))
 
 
 def test_several_minima_of_one_explanation_are_remarked_and_several_explanations_are_not(
