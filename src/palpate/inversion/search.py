@@ -23,6 +23,7 @@ from palpate.inversion.scenarios import Alternatives, scenarios_of
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.forward import SolveCounts
 from palpate.progress import Progress
+from palpate.unknowns.blocks import Choice
 
 RADIUS = 1.5  # of ln E: longest step
 FITS, FAR_FITS, STAYS = 10, 2, 0.01  # of the noise near the end, and far from it; change of its ln that ends them
@@ -241,7 +242,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         """Those of the group; at first of homogeneous tissues: responses to patches are those far away."""
         if now.group is not None:
             return scenario.group == now.group
-        return not any(k for i, k in scenario.chosen if blocks[i].choice.of_tissues)
+        return not any(k for i, k in scenario.chosen if blocks[i].choice is Choice.PATCHINESS)
 
     exact = now.moved < 1.0
     own = Candidates(kept, MOST if exact else FAR_MOST)
@@ -250,9 +251,9 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
     near_end = now.moved < LAST_FIT or (exact and now.fits >= PATIENCE)
-    settled = now.settled or (near_end and _change(now.objective, objective) < CALM)
+    settled = now.settled or (near_end and now.group is not None and _change(now.objective, objective) < CALM)
     free = now.fits + 1 < FREE[0 if exact else 1]
-    group = now.group or (None if free else mixture.explanations[0].group)
+    group = mixture.explanations[0].group if now.group is None and not free else now.group
     before = replace(
         now,
         objective=objective,
