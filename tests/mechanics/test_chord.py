@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.chord import chord_equilibria
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.finite_strain import finite_strain_model
 from palpate.mechanics.laws.registry import LAWS
 from palpate.mechanics.linear_model import linear_model
-from palpate.mesh.space import lagrange_space
 
 MODULI = np.array([3.0, 12.0])
 MOTIONS = np.array([[1.0, 0.5], [-2.0, 1.0], [4.0, 2.0]])
@@ -21,19 +19,7 @@ FAR = np.array([60.0, 0.0])  # the floor pushed through the roof
 @pytest.fixture(scope="module")
 def models(meshes):
     """Of a block of 30 mm whose floor is pushed up (mode 0) and aside (mode 1): linear, and at finite strain."""
-    mesh = meshes.box_mesh(
-        3,
-        size=30.0,
-        distortion=0.15,
-        tissues=[meshes.known("fat", nu=0.45), meshes.unknown("organ", nu=0.4)],
-        region=lambda c: (c[:, 2] > 15.0).astype(int),
-    )
-    space = lagrange_space(mesh, "P2")
-    floor = np.flatnonzero(space.points[:, 2] < 1e-9)
-    modes = np.zeros((len(floor), 3, 2))
-    modes[:, 2, 0] = modes[:, 0, 1] = np.prod(np.sin(np.pi * space.points[floor, :2] / 30.0), axis=1)
-    prescribed = meshes.prescribe(space, floor, 0.0 * modes[:, :, 0], modes)
-    constraint = outer_constraint(space, outer="fixed", **prescribed)
+    space, constraint = meshes.pushed_block()
     dilatation = Dilatation.BLENDED
     finite = finite_strain_model(space, constraint, LAWS["neo-hookean"], dilatation=dilatation)
     return linear_model(space, constraint, dilatation=dilatation), finite

@@ -22,32 +22,15 @@ MODULI = np.array([3.0, 12.0])
 FINITE = sorted(name for name, law in LAWS.items() if law.finite)
 
 
-def block(meshes, *, outer="fixed", n=3):
-    """Space and constraint of a block of 30 mm whose floor is pushed up (mode 0) and aside (mode 1) by 1 mm."""
-    mesh = meshes.box_mesh(
-        n,
-        size=30.0,
-        distortion=0.15,
-        tissues=[meshes.known("fat", nu=0.45), meshes.unknown("organ", nu=0.4)],
-        region=lambda c: (c[:, 2] > 15.0).astype(int),
-    )
-    space = lagrange_space(mesh, "P2")
-    floor = np.flatnonzero(space.points[:, 2] < 1e-9)
-    bump = np.prod(np.sin(np.pi * space.points[floor, :2] / 30.0), axis=1)
-    modes = np.zeros((len(floor), 3, 2))
-    modes[:, 2, 0], modes[:, 0, 1] = bump, bump
-    return space, outer_constraint(space, outer=outer, **meshes.prescribe(space, floor, 0.0 * modes[:, :, 0], modes))
-
-
 @pytest.fixture(scope="module", params=FINITE)
 def model(request, meshes):
-    return finite_strain_model(*block(meshes), LAWS[request.param])
+    return finite_strain_model(*meshes.pushed_block(), LAWS[request.param])
 
 
 @pytest.mark.parametrize("dilatation", Dilatation)
 @pytest.mark.parametrize("outer", ["fixed", "sliding"])
 def test_the_linear_law_gives_the_linear_model(meshes, dilatation, outer):
-    space, constraint = block(meshes, outer=outer, n=2)
+    space, constraint = meshes.pushed_block(outer=outer, n=2)
     expected = linear_model(space, constraint, dilatation=dilatation).solve(MODULI, np.array([4.0, 2.0]))
     found = finite_strain_model(space, constraint, LAWS["linear"], dilatation=dilatation).solve(
         MODULI, np.array([4.0, 2.0])
@@ -136,7 +119,9 @@ def test_a_stiffness_serves_again_where_it_would_do_once_more(model, monkeypatch
 
 
 def test_derivatives_by_poissons_ratio_are_those_of_the_solution(meshes):
-    model = finite_strain_model(*block(meshes, n=2), LAWS["mooney-rivlin"], settings=NewtonSettings(tolerance=1e-12))
+    model = finite_strain_model(
+        *meshes.pushed_block(n=2), LAWS["mooney-rivlin"], settings=NewtonSettings(tolerance=1e-12)
+    )
     q, step = np.array([5.0, 2.0]), 1e-5
     equilibrium = model.solve(MODULI, q)
     tangents = equilibrium.poisson_tangents()
@@ -168,7 +153,7 @@ def test_an_exact_factorisation_changes_the_price_and_not_the_tangent(model):
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("dilatation", Dilatation)
 def test_no_solver_changes_equilibrium_or_tangent(meshes, solver, dilatation):
-    space, constraint = block(meshes, n=2)
+    space, constraint = meshes.pushed_block(n=2)
     found = []
     for name in ("multifrontal", solver):
         settings = NewtonSettings(tolerance=1e-11, solver=name)
@@ -197,7 +182,7 @@ def test_other_modes_of_the_same_points_need_no_new_model(model):
 
 
 def test_a_constraint_that_frees_other_points_is_refused(model, meshes):
-    _, constraint = block(meshes, outer="sliding")
+    _, constraint = meshes.pushed_block(outer="sliding")
     with pytest.raises(ConfigurationError, match="other free displacements"):
         model.under(Conditions(constraint))
 
@@ -257,7 +242,7 @@ def test_a_tube_of_12_mm_is_filled_by_10_mm(meshes, law, nu):
 
 def test_newton_converges_quadratically(meshes):
     """B15's point: with the exact tangent each iteration squares the error."""
-    model = finite_strain_model(*block(meshes, n=2), LAWS["neo-hookean"])
+    model = finite_strain_model(*meshes.pushed_block(n=2), LAWS["neo-hookean"])
     q = np.array([6.0, 3.0])
     exact = replace(model, settings=NewtonSettings(tolerance=1e-13)).solve(MODULI, q).values
     balance, free = model.balance(MODULI), model.constraint.free

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.inversion import InverseProblem, LaterState, invert
+from palpate.inversion import Bounds, InverseProblem, LaterState, cheapest_posterior, gauss_newton, invert
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model
 from palpate.mesh.layers import layer_thickness_mm, layered_space, layers_round_organs
@@ -17,6 +17,7 @@ from palpate.phantoms.scene import Scene
 from palpate.study.discrepancy import discrepancy_findings, discrepancy_of, fitted_materials
 from palpate.study.estimation import Observed, conclude
 from palpate.uncertainty import FittedState
+from palpate.uncertainty.profile import Ray
 from palpate.unknowns import layer_blocks, parameter_map, unit_blocks
 from palpate.unknowns.blocks import LAYER_ODDS
 from palpate_validation.truth import exact_target
@@ -133,3 +134,19 @@ def test_a_layer_is_said_in_words_and_stands_in_the_material(sheathed, twin):
         inside = model.space.mesh.region == number
         assert np.exp(material.log_ratio[inside]) == pytest.approx(moduli[number] / moduli[REST])
     assert np.all(material.log_ratio[model.space.mesh.region <= REST] == 0.0)
+
+
+def test_with_a_layer_the_others_are_at_their_best_along_a_ray_of_all_moduli(sheathed, twins):
+    """Of a layer that is free no posterior is a parabola, not even at held moduli."""
+    inversion, _ = sheathed
+    frozen = cheapest_posterior(inversion.objective, inversion.minimum.unknowns, inversion.minimum.evaluation)
+    assert len(frozen.parameters.free_on_moduli)
+    bounds, way = twins.settings(2.0).bounds, np.array([1.0, 0.5])
+    least = gauss_newton(frozen, inversion.minimum.unknowns, bounds=bounds, tolerance=1e-10)
+    ray = Ray(frozen, least, way, np.ones(2, dtype=bool), bounds, 1.0)
+    points, _ = ray.to_level(2.0, first=0.3)
+    for distance, root, unknowns in points:
+        theta = least.unknowns[:2] + distance * way
+        best = gauss_newton(frozen, unknowns, bounds=Bounds(theta, theta), tolerance=1e-12)
+        assert root**2 == pytest.approx(2.0 * (best.evaluation.value - least.evaluation.value), abs=1e-3)
+    assert len(points) > 1

@@ -33,7 +33,6 @@ MOST = 12  # explanations of a group whose minimum is sought on the model
 ROUNDS = 4  # over all images, to find the likeliest alternatives of each
 MINIMUM = 1e-3  # decrement at which the minimum of an explanation ends: 0.045 sd from it, as a search does
 VOLUMES, VOLUME_SD, AT_ONCE = 3, 0.1, 0.8  # searches with the room of all others, its accuracy in sd, ln E a search
-HELD_SD = 0.01  # of ln E: what acts on moduli and is known better stays where it is
 DIFFERENCE = 0.05  # of ln E: step of derivatives of that room
 
 
@@ -273,9 +272,7 @@ def _volume(posterior: Posterior, minimum: Minimum, told: NDArray[np.int64]) -> 
 
     By differences.
     """
-    n, parameters, at = posterior.n_parameters, posterior.parameters, minimum.unknowns
-    free = minimum.evaluation.prior.diagonal[parameters.acting_on_moduli] < HELD_SD**-2.0
-    numbers = parameters.acting_on_moduli[free]
+    n, at, numbers = posterior.n_parameters, minimum.unknowns, posterior.parameters.free_on_moduli
     moved = np.concatenate([np.arange(n), numbers])
     others = ~np.isin(np.arange(len(at)), moved)
 

@@ -151,7 +151,8 @@ def searched(
         if best is now or change == CHANGES:
             break
         now = replace(best, settled=False, fits=0, minimum=replace(best.minimum, outcome=Outcome.STEPS))
-    return _ended(now, Mixture.of(of for each in every for of in each.explanations), bounds)
+    end = best if best.minimum.converged else now
+    return _ended(end, Mixture.of(of for each in every for of in each.explanations), bounds)
 
 
 def _followed(

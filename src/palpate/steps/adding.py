@@ -51,7 +51,7 @@ def estimate_added(
     if document["status"] != "converged":
         why = f"the earlier estimate has the status '{document['status']}'"
     elif not why and KNOWN_IMAGES not in document["files"]:
-        why = f"the earlier result has no {KNOWN_IMAGES}, as it leaves a modulus open, or is of an earlier version"
+        why = f"the earlier result has no {KNOWN_IMAGES}, as one that leaves a modulus open has none"
     if why:
         progress(Line(f"all {n_images + len(images)} later images are estimated together: {why}"))
         text = f"All {n_images + len(images)} later images were estimated together: {why}. It only takes longer."

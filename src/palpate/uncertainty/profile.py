@@ -126,10 +126,12 @@ class Ray:
     def _at_its_best(self, start: NDArray[np.float64]) -> Minimum:
         """The minimum over all that is not held, sought from unknowns (n,), and again from where a search stopped.
 
-        Where all log-moduli are held, a frozen posterior is a parabola of the others: one step leads to its minimum.
+        Where all log-moduli are held, and no other unknown acts on moduli, a frozen posterior is a parabola: one step
+        leads to its minimum.
         """
-        if self.held.all() and isinstance(self.fixed, FrozenPosterior):
-            return at_held_moduli(self.fixed, start)
+        fixed = self.fixed
+        if self.held.all() and isinstance(fixed, FrozenPosterior) and not len(fixed.parameters.free_on_moduli):
+            return at_held_moduli(fixed, start)
         bounds = self.bounds.fixed(start[: len(self.held)], self.held)
         for _ in range(TRIES):
             found = gauss_newton(self.fixed, start, bounds=bounds, tolerance=ON_RAY)

@@ -18,6 +18,7 @@ from palpate.unknowns.blocks import KNOWN_MODULUS, Acts, Alternative, Block, in_
 from palpate.unknowns.likelihood import Likelihood
 
 LOADS = "the known loads"
+HELD_SD = 0.01  # of ln E: what acts on moduli and is known better stays where it is
 LEVELS_OFF = 1.5  # of ln E: distance from a place at which the room that theta leaves all others levels off
 
 
@@ -268,6 +269,12 @@ class ParameterMap:
     def acting_on_moduli(self) -> NDArray[np.int64]:
         """Numbers (n,) of the blocks' unknowns by which moduli of regions differ, in every later state."""
         return self._layout.on_moduli
+
+    @property
+    def free_on_moduli(self) -> NDArray[np.int64]:
+        """Those of them (n,) that the prior leaves free: layers unlike their tissues, known moduli that are a range."""
+        own = self.acting_on_moduli
+        return np.asarray(own[self.prior_matrix.diagonal[own] < HELD_SD**-2.0])
 
     @property
     def shares_on_moduli(self) -> NDArray[np.float64]:
