@@ -457,7 +457,8 @@ def test_a_telephone_shows_it_without_scrolling_sideways(opened):
 
 
 def pictures_stand(page):
-    for section, count in (("alignment", 3), ("slices", 3), ("organs", 2), ("mesh", 3)):
+    planes = 3  # slices are drawn with lines, with the modulus and with the displacement
+    for section, count in (("alignment", planes), ("slices", 3 * planes), ("organs", 2), ("mesh", 3)):
         still = page.locator(f"section.{section} .still")
         assert still.locator("img:visible, figure > svg:visible").count() == count
         assert page.locator(f"section.{section} canvas:visible").count() == 0
