@@ -68,8 +68,8 @@ def methods_text(data: ReportData) -> Methods:
             " whether the frame moves, and whether each image draws the surfaces alike. Each explanation counted"
             f" by its evidence in Laplace's approximation {cite('laplace')}, at its own minimum over all others."
             f" Minima were found by Gauss-Newton steps in a trust region {cite('nocedal')} on reduced models"
-            f" {cite('reduced')}, which were made exact at the posterior's mean. {len(data.document['starts'])} starts"
-            " looked for other minima."
+            f" {cite('reduced')}, which were made exact at the mean of each group of explanations."
+            f" {len(data.document['starts'])} starts looked for other minima."
             f"{onwards if law is not None and law.finite else ''}"
         ),
         (
