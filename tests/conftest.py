@@ -162,7 +162,7 @@ def make_estimation(displacement: np.ndarray) -> Estimation:
         status="converged",
         reason="the predicted decrease of the objective fell below its tolerance",
         estimates=(make_estimate("prostate", 58.9, 60.0), make_estimate("bladder", 31.2)),
-        covariance=Covariance(np.array([[0.01, -0.003], [-0.003, 0.06]]), *np.zeros((3, 2, 2))),
+        covariance=Covariance(np.array([[0.01, -0.003], [-0.003, 0.06]]), *np.zeros((3, 2, 2)), np.eye(2)),
         starts=tuple(make_start(ratio) for ratio in (0.5, 2.0, 8.0)),
         fits=((fit, dataclasses.replace(fit, tissue="bladder")),),
         displacements=(displacement,),

@@ -118,18 +118,18 @@ def test_so_it_is_at_the_end_of_a_search(patients):
     assert found.mixture.mean[0] == pytest.approx(THETA[np.argmax(levels)], abs=0.1 * spread(levels)[1])
 
 
-def test_the_room_of_all_else_decides_where_theta_is_and_is_no_part_of_the_evidence(patients):
-    """-J - 1/2 ln det H + 1/2 ln det P there, P = 1, also where the room is not 0."""
-    rooms = []
-    for seed in range(3):
-        body, parameters, seen = yielding(np.random.default_rng(seed), pulls=0.05)
-        objective = objective_of(patients, body, parameters, seen)
-        (found,) = mixture_at(objective).explanations
-        rooms.append(abs(found.volume.at(found.theta)[0]))
-        there = objective(found.minimum.unknowns)
-        expected = -there.value - 0.5 * np.linalg.slogdet(there.matrix.dense)[1]
-        assert found.level == pytest.approx(expected, abs=1e-6)
-    assert max(rooms) > 0.1
+@pytest.mark.parametrize("seed", range(3))
+def test_level_and_width_are_those_of_the_integral_over_all_else(patients, seed):
+    """Where the room is not 0, and bends: the Gauss-Newton matrix has neither."""
+    body, parameters, seen = yielding(np.random.default_rng(seed), pulls=0.05)
+    (found,) = mixture_at(objective_of(patients, body, parameters, seen)).explanations
+    levels, _ = integrated(body, seen, np.ones(2))
+    top = int(np.argmax(levels))
+    step = THETA[1] - THETA[0]
+    bend = -(levels[top + 1] + levels[top - 1] - 2.0 * levels[top]) / step**2
+    assert found.covariance[0, 0] == pytest.approx(1.0 / bend, rel=0.1)
+    assert found.level == pytest.approx(levels[top] - 0.5 * np.log(bend), abs=0.05)
+    assert abs(found.volume.slope[0]) > 0.1
 
 
 def test_an_explanation_weighs_as_much_as_its_integral_over_all_unknowns(patients):

@@ -120,7 +120,7 @@ def with_ratio(case_result):
     estimation = case_result.estimation
     found = PoissonRatioEstimate("prostate", 0.47, (0.44, 0.49), "weak", "it is wide", {"noise": 1})
     noise = np.diag([0.01, 0.06, 0.3])
-    every = Covariance(noise, *np.zeros((3, *noise.shape)))
+    every = Covariance(noise, *np.zeros((3, *noise.shape)), noise)
     estimation = replace(estimation, poisson_ratios=(found,), covariance=every.of_first(2), with_ratios=every)
     space = with_ratios(case_result.space, estimation.found_ratios)
     return replace(case_result, case=seeking(case_result.case), estimation=estimation, space=space)

@@ -47,7 +47,7 @@ def test_the_document_has_the_fixed_keys(case_result):
 
 
 def test_the_document_is_strict_json(case_result):
-    broken = with_estimation(case_result, covariance=Covariance(*np.full((4, 2, 2), np.nan)))
+    broken = with_estimation(case_result, covariance=Covariance(*np.full((5, 2, 2), np.nan)))
     document = broken.to_dict()
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert document["correlation"] == [[None, None], [None, None]]

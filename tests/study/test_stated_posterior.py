@@ -37,7 +37,7 @@ def posterior_of(objective, minimum):
     covariance = np.linalg.inv(minimum.evaluation.matrix.dense)[:2, :2]
     zero = np.zeros_like(covariance)
     alone = np.ones(1), minimum.unknowns[None, :2], covariance[None]
-    mixture = StatedMixture(*alone, Covariance(covariance, zero, zero, zero))
+    mixture = StatedMixture(*alone, Covariance(covariance, zero, zero, zero, covariance))
     return StatedPosterior(frozen_posterior(objective, minimum.unknowns), minimum, mixture)
 
 

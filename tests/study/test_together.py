@@ -37,7 +37,7 @@ def posterior_of(inversion, covariance):
     minimum, zero = inversion.minimum, np.zeros((2, 2))
     fixed = fixed_correspondence(inversion.objective, minimum.unknowns, minimum.evaluation)
     alone = np.ones(1), minimum.unknowns[None, :2], covariance[None]
-    return StatedPosterior(fixed, minimum, StatedMixture(*alone, Covariance(covariance, zero, zero, zero)))
+    return StatedPosterior(fixed, minimum, StatedMixture(*alone, Covariance(covariance, zero, zero, zero, covariance)))
 
 
 def no_errors(inversion):

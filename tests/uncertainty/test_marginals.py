@@ -145,7 +145,7 @@ def causes(*, grown=1.0, held=0.003):
     noise, layer, offset = 0.6 * grown * POSTERIOR, 0.4 * grown * POSTERIOR, held * np.eye(2)
     mesh = np.diag([0.001, 0.002])
     given = {"causes": {"layer": layer, "offset": offset}, "held": {"offset": offset}}
-    return Covariance(noise, layer + offset, 0.002 * np.eye(2), mesh, **given)
+    return Covariance(noise, layer + offset, 0.002 * np.eye(2), mesh, POSTERIOR, **given)
 
 
 ALONE = ((0, 0, 0), 1.0, (1.0, 0.5))

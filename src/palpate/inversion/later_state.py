@@ -14,7 +14,7 @@ from palpate.errors import ConfigurationError
 from palpate.mechanics.finite_strain import FiniteStrainModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.linear_model import LinearModel
-from palpate.observation.contract import Float, Imaged, Observation, OfMaterial, n_seen, seen_by
+from palpate.observation.contract import Float, Imaged, Observation, OfMaterial, Rematched, n_seen, seen_by
 from palpate.observation.noise_model import NoiseModel
 from palpate.unknowns.parameters import ParameterMap
 
@@ -53,6 +53,17 @@ class LaterState:
     def seen(self, displacement: NDArray[Float]) -> NDArray[Float]:
         """What is observed (n_observed,) or (n_observed, k) of displacements (n_dof,) or (n_dof, k) mm, in order."""
         return np.concatenate([seen_by(observation, displacement) for observation in self.observations])
+
+    @property
+    def moved(self) -> float:
+        """Mean square (mm^2) of how far what is observed lies from where the reference image shows it."""
+        found = list[float]()
+        for observation in self.observations:
+            still = np.zeros(n_seen(observation))
+            if isinstance(observation, Rematched):
+                residuals = observation.rematched(still, 0.0).residuals(still, 0.0)
+                found.append(float(residuals.weights @ residuals.values**2))
+        return float(np.mean(found)) if found else 0.0
 
     def modes_at_rest(
         self, observation: Observation, which: Mapping[str, slice]

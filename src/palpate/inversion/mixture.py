@@ -18,8 +18,9 @@ from scipy import linalg, special
 from palpate.approximation.contract import determined
 from palpate.errors import EstimationError, SolverError
 from palpate.inversion.frozen_posterior import Posterior
+from palpate.inversion.laplace import MarginalMinimum, Nearby, marginal_minimum
 from palpate.inversion.objective import Evaluation
-from palpate.inversion.optimise import Bounds, Minimum, gauss_newton, posterior_sd, same_minimum
+from palpate.inversion.optimise import Bounds, Minimum, Outcome, same_minimum
 from palpate.inversion.scenarios import Alternatives, alternatives_of, frames_of, scenarios_of
 from palpate.mechanics.solvers.cholesky import backward, forward, lower_factor
 from palpate.parallel import mapped
@@ -31,9 +32,7 @@ TRUSTED_SD = 0.5  # of ln E: how far residuals are taken for linear where explan
 SEEN = 6.0  # of the log-evidence: explanations that are less likely than the best one by so much are left out
 MOST = 12  # explanations of a group whose minimum is sought on the model
 ROUNDS = 4  # over all images, to find the likeliest alternatives of each
-MINIMUM = 1e-3  # decrement at which the minimum of an explanation ends: 0.045 sd from it, as a search does
-VOLUMES, VOLUME_SD, AT_ONCE = 3, 0.1, 0.8  # searches with the room of all others, its accuracy in sd, ln E a search
-DIFFERENCE = 0.05  # of ln E: step of derivatives of that room
+BESIDE = 1.0  # standard deviations from where a scenario's likeliest explanation lies to another one's minimum
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,16 +163,24 @@ def mixture_of(
     n = posterior.n_parameters
     with determined():
         compared = LinearEvidence.of(posterior.parameters, evaluation, unknowns).compared(candidates)
-    known = {of.key: (of.minimum.unknowns, of.volume) for of in (earlier.explanations if earlier else ())}
-    like = earlier.explanations[0].volume if earlier else None
-    jobs = [(of, *known.get((0, tuple(sorted(of.chosen))), (of.unknowns, like))) for of in compared]
-    found = [each for each in mapped(lambda job: _laplace(posterior, bounds, *job), jobs) if each is not None]
+    known = {of.key: of.minimum.unknowns for of in (earlier.explanations if earlier else ())}
+    first = {of.scenario.chosen: of for of in reversed(compared)}  # the likeliest of each scenario
+    begin = {key: known.get((0, tuple(sorted(of.chosen))), of.unknowns) for key, of in first.items()}
+    led = dict(zip(first, mapped(lambda key: _laplace(posterior, bounds, first[key], begin[key]), first), strict=True))
+
+    def beside(of: _Compared) -> _Laplace | None:
+        """That of another explanation of a scenario, seen from where the likeliest one led."""
+        leads = led[of.scenario.chosen]
+        return None if leads is None else _laplace_beside(posterior, bounds, of, leads)
+
+    others = [of for of in compared if of is not first[of.scenario.chosen]]
+    found = [each for each in (*led.values(), *mapped(beside, others)) if each is not None]
     if not found:
         raise EstimationError("the model cannot be solved near any explanation of the images; check images and mesh")
     likeliest = max(found, key=lambda each: each.level)
-    for each in mapped(lambda begin: _laplace(posterior, bounds, likeliest.of, begin), begins):
-        others = [other.minimum for other in found if other.of is likeliest.of]
-        if each is not None and not any(same_minimum(each.minimum.unknowns, other, n) for other in others):
+    for each in mapped(lambda place: _laplace(posterior, bounds, likeliest.of, place), begins):
+        same = [other.found.minimum for other in found if other.of is likeliest.of]
+        if each is not None and not any(same_minimum(each.found.minimum.unknowns, other, n) for other in same):
             found.append(each)
     squares = posterior(unknowns)
     robust = (evaluation.value - evaluation.prior_value) - (squares.value - squares.prior_value)  # of outliers
@@ -183,10 +190,10 @@ def mixture_of(
             each.of.scenario.words,
             each.of.images,
             1.0,
-            each.minimum.unknowns[:n],
-            each.minimum.evaluation.covariance_columns(n)[:n],
-            each.minimum,
-            each.volume,
+            each.found.minimum.unknowns[:n],
+            each.found.covariance,
+            each.found.minimum,
+            each.found.volume,
             each.level - robust,
             each.of.scenario.group,
             sum(other.of is each.of for other in found[:i]),
@@ -214,49 +221,45 @@ class _Compared:
 
 @dataclass(frozen=True, slots=True)
 class _Laplace:
-    """The minimum of an explanation on the model, and the log of its probability but for a constant."""
+    """The minimum of an explanation on the model, what is known around it, and the log of its probability."""
 
     of: _Compared
-    minimum: Minimum
-    volume: Volume | None
+    found: MarginalMinimum
+    nearby: Nearby
     level: float
 
 
-def _laplace(
-    posterior: Posterior, bounds: Bounds, of: _Compared, begin: NDArray[np.float64], volume: Volume | None = None
-) -> _Laplace | None:
-    """An explanation's minimum, sought from unknowns (n_unknowns,); None where the model cannot be solved there.
-
-    It is that of the marginal posterior of theta, J + 1/2 ln det H_yy with all other unknowns y at their best: that of
-    J alone lies where these have most room, which soft organs leave them (Cox & Reid, J. R. Stat. Soc. B 49 (1987) 1).
-    The log-evidence is -J - 1/2 ln det H + 1/2 ln det P, H = J^T W J + P, less what variances of theta are more than
-    the bounds of the search leave. volume: that with which it begins.
-    """
-    own = posterior.believing(replace(posterior.parameters.choosing(dict(of.chosen)), volume=volume))
-    n, start = own.n_parameters, begin.copy()
-    start[:n] = np.clip(start[:n], bounds.lower, bounds.upper)
+def _laplace(posterior: Posterior, bounds: Bounds, of: _Compared, begin: NDArray[np.float64]) -> _Laplace | None:
+    """An explanation, its minimum sought from unknowns (n_unknowns,); None where the model cannot be solved there."""
+    own = posterior.believing(replace(posterior.parameters.choosing(dict(of.chosen)), volume=None))
     try:
-        minimum = gauss_newton(own, start, bounds=bounds, tolerance=MINIMUM)
-        for _ in range(VOLUMES if own.parameters.n_coefficients else 0):
-            theta, sd = minimum.unknowns[:n], posterior_sd(minimum, n)
-            open_ = sd > bounds.room / np.sqrt(12.0)  # on such a plain any slope would lead to a bound
-            own = own.believing(replace(own.parameters, volume=_volume(own, minimum, np.flatnonzero(~open_))))
-            within = bounds.around(theta, AT_ONCE)
-            minimum = gauss_newton(own, minimum.unknowns, bounds=within, tolerance=MINIMUM)
-            if np.all(np.abs(minimum.unknowns[:n] - theta) < VOLUME_SD * sd):
-                break
+        found, nearby = marginal_minimum(own, begin, bounds)
     except SolverError:
         return None
-    there, theta = minimum.evaluation, minimum.unknowns[:n]
-    if not np.isfinite(there.value):
+    return _levelled(own.parameters, bounds, of, found, nearby)
+
+
+def _laplace_beside(posterior: Posterior, bounds: Bounds, of: _Compared, leads: _Laplace) -> _Laplace | None:
+    """An explanation of the same scenario as another one, with what is known around that one's minimum."""
+    own = posterior.believing(replace(posterior.parameters.choosing(dict(of.chosen)), volume=None))
+    parabola = leads.nearby.parabola(own.parameters)
+    target, away = parabola.minimum(bounds)
+    outcome = Outcome.CONVERGED if away < BESIDE else Outcome.STEPS
+    try:
+        found = leads.nearby.at_minimum(own, target, parabola, outcome)
+    except SolverError:
         return None
-    parameters = own.parameters
-    beyond = beyond_bounds(there.covariance_columns(n)[:n], bounds)
-    determinants = sum(of.log_determinant for of in parameters.priors) - log_det(there.matrix) - beyond
-    room = parameters.volume
-    added = 0.0 if room is None else room.at(room.of(minimum.unknowns))[0]
-    level = of.log_prior + of.several + 0.5 * determinants - (there.value - added)
-    return _Laplace(of, minimum, parameters.volume, level)
+    return _levelled(own.parameters, bounds, of, found, leads.nearby)
+
+
+def _levelled(
+    parameters: ParameterMap, bounds: Bounds, of: _Compared, found: MarginalMinimum, nearby: Nearby
+) -> _Laplace | None:
+    """The log-evidence -M - 1/2 ln det d2M/dt2 + 1/2 ln det P, less what variances are more than bounds leave."""
+    if not np.isfinite(found.value):
+        return None
+    determinants = sum(prior.log_determinant for prior in parameters.priors) - beyond_bounds(found.covariance, bounds)
+    return _Laplace(of, found, nearby, of.log_prior + of.several + 0.5 * determinants - found.value)
 
 
 def beyond_bounds(covariance: NDArray[np.float64], bounds: Bounds) -> float:
@@ -265,27 +268,6 @@ def beyond_bounds(covariance: NDArray[np.float64], bounds: Bounds) -> float:
     seen = np.isfinite(np.diag(covariance)) & (room > 0.0)
     variances = np.linalg.eigvalsh((covariance / np.outer(*(np.where(seen, room, 1.0),) * 2))[np.ix_(seen, seen)])
     return float(np.log(np.maximum(variances, 1.0)).sum())
-
-
-def _volume(posterior: Posterior, minimum: Minimum, told: NDArray[np.int64]) -> Volume:
-    """How 1/2 ln det H_yy changes with the log-moduli that are `told`, and what else acts on moduli, at a minimum.
-
-    By differences.
-    """
-    n, at, numbers = posterior.n_parameters, minimum.unknowns, posterior.parameters.free_on_moduli
-    moved = np.concatenate([np.arange(n), numbers])
-    others = ~np.isin(np.arange(len(at)), moved)
-
-    def room(matrix: Arrowhead) -> float:
-        """1/2 ln det H_yy."""
-        return 0.5 * log_det(matrix.among(others))
-
-    here, slope = room(minimum.evaluation.matrix), np.zeros(len(moved))
-    for i in (*told.tolist(), *range(n, len(moved))):
-        there = at.copy()
-        there[moved[i]] += DIFFERENCE
-        slope[i] = (room(posterior(there).matrix) - here) / DIFFERENCE
-    return Volume(slope, at[moved], numbers)
 
 
 def log_det(matrix: Arrowhead) -> float:

@@ -160,7 +160,7 @@ def _told(inversion: Inversion, settings: InversionSettings, own: Covariance) ->
     posterior with an open end, which is far from normal: added images would be held where nothing tells a modulus.
     """
     parameters, n_images = inversion.objective.parameters, len(inversion.objective.states)
-    wider, beside = correlated_factor(inversion.mixture, own), own.of_held + own.grid
+    wider, beside = correlated_factor(own), own.of_held + own.grid
     seen = np.isfinite(wider) & np.isfinite(np.diag(beside))  # a modulus that moves nothing has no errors
     errors = {"wider": np.where(seen, wider, 1.0), "beside": np.where(np.outer(seen, seen), beside, 0.0)}
     try:

@@ -68,13 +68,14 @@ class Covariance:
     grid: the place of the voxels, as far as it is not in noise that the residuals tell, which voxels round; mesh: what
     another mesh would make of it (of Young's moduli); held: the part of causes by blocks that are held. given_model:
     all that would be left if frame, drawing and material were as the model has them, and only the drivers' motion
-    unknown.
+    unknown. plain: H^-1, what noise and prior would be if residuals were as independent as they are counted.
     """
 
     noise: NDArray[np.float64]
     prior: NDArray[np.float64]
     grid: NDArray[np.float64]
     mesh: NDArray[np.float64]
+    plain: NDArray[np.float64]
     causes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     held: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     given_model: NDArray[np.float64] | None = None
@@ -97,9 +98,10 @@ class Covariance:
 
     def of_first(self, n: int) -> Covariance:
         """That of the first n."""
-        noise, prior, grid, mesh = (part[:n, :n] for part in (self.noise, self.prior, self.grid, self.mesh))
+        every = (self.noise, self.prior, self.grid, self.mesh, self.plain)
+        noise, prior, grid, mesh, plain = (part[:n, :n] for part in every)
         causes, held = ({k: part[:n, :n] for k, part in of.items()} for of in (self.causes, self.held))
-        return Covariance(noise, prior, grid, mesh, causes, held, self.given_model)
+        return Covariance(noise, prior, grid, mesh, plain, causes, held, self.given_model)
 
     def shares(self, number: int) -> dict[str, float]:
         """Share of each cause, 0 to 1, in the variance of the log-modulus with a `number`."""
@@ -154,7 +156,7 @@ def covariance_of(
     if parameters.earlier:
         causes[EARLIER] = np.asarray(rows @ ((evaluation.prior - parameters.prior_of_blocks) @ inverse))
     padded = np.pad(mesh, (0, len(numbers) - n))
-    return Covariance(noise, prior, grid, padded, causes, held, sum(left, mesh))
+    return Covariance(noise, prior, grid, padded, rows[:, numbers], causes, held, sum(left, mesh))
 
 
 def _held(objective: Objective, evaluation: Evaluation, rows: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:

@@ -44,13 +44,12 @@ class StatedMixture:
 def stated_mixture(mixture: Mixture, own: Covariance, blocks: tuple[Block, ...]) -> StatedMixture:
     """A mixture whose explanations have the errors of the likeliest one, `own`, beside those of the posterior.
 
-    Residuals are alike over surfaces in other ways than their number says: with the sandwich C_s and the posterior's
-    covariance C of the likeliest explanation, every standard deviation is larger by the factor (C_s / C)^(1/2), 1 to
-    `CORRELATED`. What blocks that are held, the voxels' place and the mesh add is the same in all. The variance is that
+    Residuals are alike over surfaces in other ways than their number says: with the sandwich C_s and H^-1 of the
+    likeliest explanation, every standard deviation is larger by the factor (C_s / H^-1)^(1/2), 1 to `CORRELATED`. What blocks that are held, the voxels' place and the mesh add is the same in all. The variance is that
     within explanations and that between their means (law of total variance). By how much it is larger than that of the
     likeliest one is told by what distinguishes them.
     """
-    held, factor = own.of_held, correlated_factor(mixture, own)
+    held, factor = own.of_held, correlated_factor(own)
     sandwich = own.noise + own.prior - held
     every = np.stack([np.outer(factor, factor) * of.covariance for of in mixture.explanations])
     weights, theta = mixture.weights, np.stack([of.theta for of in mixture.explanations])
@@ -74,10 +73,10 @@ def stated_mixture(mixture: Mixture, own: Covariance, blocks: tuple[Block, ...])
     return StatedMixture(weights, theta, every + known, whole)
 
 
-def correlated_factor(mixture: Mixture, own: Covariance) -> NDArray[np.float64]:
+def correlated_factor(own: Covariance) -> NDArray[np.float64]:
     """The factor (n,) on each standard deviation, 1 to `CORRELATED`, by residuals that are alike over surfaces."""
-    sandwich = np.diag(own.noise + own.prior - own.of_held)
-    return np.clip(np.sqrt(sandwich / np.diag(mixture.explanations[0].covariance)), 1.0, CORRELATED)
+    sandwich = own.noise + own.prior - own.of_held
+    return np.clip(np.sqrt(np.diag(sandwich) / np.diag(own.plain)), 1.0, CORRELATED)
 
 
 def _groups(mixture: Mixture, blocks: tuple[Block, ...]) -> Mapping[str, NDArray[np.float64]]:

@@ -1,0 +1,239 @@
+"""Laplace's approximation of what is left of a posterior when all that acts on no modulus is integrated out.
+
+Let t be the log-moduli and what else acts on moduli, y all other unknowns. Given t the residuals are linear in y, and
+the integral over y is exact: of J(t, y) it leaves M(t) = min_y J + 1/2 ln det H_yy. Where soft organs leave the others
+more room, its minimum is not that of J (Cox & Reid, J. R. Stat. Soc. B 49 (1987) 1). M has few coordinates: it is seen
+at a place, and on either side of it along the axes in which the Gauss-Newton matrix of J is a unit matrix, as in
+integrated nested Laplace approximations (Rue, Martino & Chopin, J. R. Stat. Soc. B 71 (2009) 319, section 6.1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.inversion.frozen_posterior import Posterior
+from palpate.inversion.objective import Evaluation
+from palpate.inversion.optimise import Bounds, Minimum, Outcome
+from palpate.unknowns.parameters import ParameterMap, Volume
+
+ASIDE, FURTHEST = 1.0, 0.4  # from a place to either side: standard deviations of J, and ln E at most
+LEAST = 0.25  # curvature of M over that of J by the Gauss-Newton matrix: of less, that of J counts
+PLACES, NEAR = 8, 0.1  # at most; a step of fewer standard deviations from one leads to the minimum
+AT_ONCE = 0.8  # of ln E: a longer step is cut
+RIDGE = 1e-12  # of correlations, which prevents a singular matrix
+
+
+@dataclass(frozen=True, slots=True)
+class MarginalMinimum:
+    """The minimum of M, with all other unknowns at their best there.
+
+    covariance (n_parameters, n_parameters): of theta, infinite where it moves nothing; value: M + 1/2 ln det of its
+    second derivatives; volume: how 1/2 ln det H_yy changes with t there; the evaluation is with it.
+    """
+
+    minimum: Minimum
+    covariance: NDArray[np.float64]
+    value: float
+    volume: Volume
+
+
+def marginal_minimum(
+    posterior: Posterior, unknowns: NDArray[np.float64], bounds: Bounds, places: int = PLACES
+) -> tuple[MarginalMinimum, Nearby]:
+    """The minimum of M, sought from unknowns (n_unknowns,) within bounds, and what is known around it.
+
+    A step leads from each of some places to the minimum of the parabola there, half as far where M is no smaller.
+    Raises `SolverError` where the model cannot be solved.
+    """
+    at, before, best = unknowns.copy(), unknowns, np.inf
+    at[: posterior.n_parameters] = np.clip(at[: posterior.n_parameters], bounds.lower, bounds.upper)
+    for left in reversed(range(places)):
+        nearby = Nearby.of(posterior, at, bounds)
+        parabola = nearby.parabola(posterior.parameters)
+        if parabola.value > best + 1.0 and left:
+            at = 0.5 * (at + before)
+            continue
+        before, best = at, min(best, parabola.value)
+        target, away = parabola.minimum(bounds)
+        if away < NEAR:
+            break
+        at = target
+    outcome = Outcome.CONVERGED if away < NEAR else Outcome.STEPS
+    return nearby.at_minimum(posterior, target, parabola, outcome), nearby
+
+
+@dataclass(frozen=True, slots=True)
+class Nearby:
+    """A posterior seen at a place and on either side of it along axes of t.
+
+    moved (n,): numbers of t among the unknowns; axes U (n, n): columns with U^T S U = 1, S the Schur complement of the
+    Gauss-Newton matrix, of what is known best first, which moves what is known less; steps (n,): how far along each;
+    open (n,): those so long that bounds cut them; places (1 + 2 n, n_unknowns) with their evaluations: the centre,
+    those before, and those behind.
+    """
+
+    moved: NDArray[np.int64]
+    axes: NDArray[np.float64]
+    steps: NDArray[np.float64]
+    open: NDArray[np.bool_]
+    places: NDArray[np.float64]
+    evaluations: tuple[Evaluation, ...]
+
+    @classmethod
+    def of(cls, posterior: Posterior, unknowns: NDArray[np.float64], bounds: Bounds) -> Nearby:
+        """It around unknowns (n_unknowns,), with the axes under the posterior's own prior."""
+        n, centre = posterior.n_parameters, posterior(unknowns)
+        seen = np.flatnonzero(centre.matrix.diagonal[:n] > 0.0)
+        moved = np.concatenate([seen, posterior.parameters.free_on_moduli])
+        unit = np.zeros((len(unknowns), len(moved)))
+        unit[moved, np.arange(len(moved))] = 1.0
+        axes = _root(centre.matrix.grounded().solve(unit)[moved])
+        longest = np.abs(axes[: len(seen)])
+        room = bounds.room[seen, None] / np.sqrt(12.0)
+        steps = np.minimum(ASIDE, FURTHEST / np.maximum(longest.max(axis=0, initial=0.0), FURTHEST))
+        places = np.repeat(unknowns[None], 1 + 2 * len(moved), axis=0)
+        aside = (axes * steps).T
+        places[1:, moved] += np.concatenate([aside, -aside])
+        evaluations = (centre, *(posterior(place) for place in places[1:]))
+        return cls(moved, axes, steps, np.any(longest > room, axis=0), places, evaluations)
+
+    def parabola(self, parameters: ParameterMap) -> Parabola:
+        """M around the place under a prior of the unknowns."""
+        values, rooms, best = list[float](), list[float](), list[NDArray[np.float64]]()
+        parameters, centre = replace(parameters, volume=None), self.places[0]
+        others = np.ones(self.places.shape[1], dtype=bool)
+        others[self.moved] = False
+        others[: parameters.n_parameters] = False
+        for place, seen in zip(self.places, self.evaluations, strict=True):
+            there = seen.under(parameters, place)
+            room, step = _followed(there, others)
+            values.append(there.value + 0.5 * float(there.score[others] @ step))
+            rooms.append(room)
+            best.append(place.copy())
+            best[-1][others] += step
+        n, twice = len(self.moved), 2.0 * self.steps
+        of, room = np.array(values), np.array(rooms)
+
+        def slopes(of: NDArray[np.float64]) -> NDArray[np.float64]:
+            """By differences of both sides."""
+            return np.asarray((of[1 : n + 1] - of[n + 1 :]) / twice)
+
+        def curvatures(of: NDArray[np.float64]) -> NDArray[np.float64]:
+            """By those of both sides and the centre."""
+            return np.asarray((of[1 : n + 1] + of[n + 1 :] - 2.0 * of[0]) / self.steps**2)
+
+        told = ~self.open  # on a plain any slope of the room would lead to a bound
+        slope, bend = slopes(of) + told * slopes(room), curvatures(of) + told * curvatures(room)
+        squared = self._schur(self.evaluations[0].under(parameters, centre))
+        own = np.sqrt(np.diag(squared))
+        length = np.sqrt(np.where(told & (bend > LEAST * own**2), bend, own**2)) / own
+        follow = (np.stack(best[1 : n + 1]) - np.stack(best[n + 1 :])).T / twice if n else np.zeros((len(best[0]), 0))
+        return Parabola(
+            self.moved,
+            self.axes,
+            of[0] + room[0],
+            slope,
+            length[:, None] * squared * length,
+            told * slopes(room),
+            best[0],
+            follow,
+        )
+
+    def _schur(self, there: Evaluation) -> NDArray[np.float64]:
+        """U^T S U (n, n) of an evaluation at the centre, under any prior."""
+        unit = np.zeros((there.matrix.size, len(self.moved)))
+        unit[self.moved, np.arange(len(self.moved))] = 1.0
+        inverse = np.linalg.inv(self.axes)
+        return np.asarray(np.linalg.inv(inverse @ there.matrix.grounded().solve(unit)[self.moved] @ inverse.T))
+
+    def at_minimum(
+        self, posterior: Posterior, unknowns: NDArray[np.float64], parabola: Parabola, outcome: Outcome
+    ) -> MarginalMinimum:
+        """What is stated of M at its minimum with a posterior, unknowns (n_unknowns,)."""
+        n, inverse = posterior.n_parameters, np.linalg.inv(self.axes)
+        slope = np.zeros(n + len(posterior.parameters.free_on_moduli))
+        seen = len(self.moved) - (len(slope) - n)
+        slope[self.moved[:seen]], slope[n:] = np.split(inverse.T @ parabola.room, [seen])
+        numbers = posterior.parameters.free_on_moduli
+        volume = Volume(slope, np.concatenate([unknowns[:n], unknowns[numbers]]), numbers)
+        own = posterior.believing(replace(posterior.parameters, volume=volume))
+        there = own(unknowns)
+        others = np.ones(len(unknowns), dtype=bool)
+        others[self.moved] = False
+        others[:n] = False
+        room, step = _followed(there, others)
+        at = unknowns.copy()
+        at[others] += step
+        value = there.value - volume.at(volume.of(unknowns))[0] + 0.5 * float(there.score[others] @ step) + room
+        log_det = float(np.linalg.slogdet(parabola.bend)[1]) - 2.0 * float(np.linalg.slogdet(self.axes)[1])
+        covariance = np.diag(np.full(n, np.inf))
+        of_t = self.axes @ np.linalg.solve(parabola.bend, self.axes.T)
+        covariance[np.ix_(self.moved[:seen], self.moved[:seen])] = of_t[:seen, :seen]
+        return MarginalMinimum(
+            Minimum(at, there, outcome, (), len(self.evaluations) + 1), covariance, value + 0.5 * log_det, volume
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Parabola:
+    """M(U xi) = value + slope . xi + 1/2 xi . B xi along the axes U of t, B `bend`; the others `best` + `follow` xi.
+
+    B (n, n) has the second differences of M on its diagonal, beside it the correlations of the Gauss-Newton matrix.
+
+    room (n,): the part of the slope that is of 1/2 ln det H_yy; best (n_unknowns,), follow (n_unknowns, n).
+    """
+
+    moved: NDArray[np.int64]
+    axes: NDArray[np.float64]
+    value: float
+    slope: NDArray[np.float64]
+    bend: NDArray[np.float64]
+    room: NDArray[np.float64]
+    best: NDArray[np.float64]
+    follow: NDArray[np.float64]
+
+    def minimum(self, bounds: Bounds) -> tuple[NDArray[np.float64], float]:
+        """All unknowns (n_unknowns,) at its minimum within bounds, and the longest step along an axis to it.
+
+        A log-modulus that a bound stops stays there, and the others follow.
+        """
+        n, count = len(bounds.lower), len(self.moved)
+        theta = self.moved[self.moved < n]
+        low, high = np.full(count, -np.inf), np.full(count, np.inf)
+        low[: len(theta)] = np.maximum(bounds.lower[theta] - self.best[theta], -AT_ONCE)
+        high[: len(theta)] = np.minimum(bounds.upper[theta] - self.best[theta], AT_ONCE)
+        inverse = np.linalg.inv(self.axes)
+        away, free = np.linalg.solve(self.bend, -self.slope), np.ones(count, dtype=bool)
+        step = self.axes @ away
+        while np.any(beyond := free & ((step < low) | (step > high))):
+            step[beyond], free = np.clip(step, low, high)[beyond], free & ~beyond
+            stiff, pull = inverse.T @ self.bend @ inverse, inverse.T @ self.slope
+            rest = -pull - stiff[:, ~free] @ step[~free]
+            step[free] = np.linalg.solve(stiff[np.ix_(free, free)], rest[free])
+        away = inverse @ step
+        at = self.best + self.follow @ away
+        at[self.moved] = self.best[self.moved] + step
+        at[theta] = np.clip(at[theta], bounds.lower[theta], bounds.upper[theta])
+        return at, float(np.abs(away).max(initial=0.0))
+
+
+def _followed(there: Evaluation, others: NDArray[np.bool_]) -> tuple[float, NDArray[np.float64]]:
+    """1/2 ln det H_yy, and the step (n_y,) of all unknowns that are among the `others` to their best."""
+    matrix = there.matrix.among(others).grounded()
+    eliminated = matrix.eliminated()
+    halves, right = eliminated.right(-there.score[others])
+    of_images = sum(float(np.log(np.diag(factor)).sum()) for factor in eliminated.factors)
+    room = of_images + 0.5 * float(np.linalg.slogdet(eliminated.left)[1])
+    return room, eliminated.followed(halves, np.linalg.solve(eliminated.left, right))
+
+
+def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """U (n, n) with U U^T a covariance (n, n), triangular once the smallest variances stand first."""
+    sd, found = np.sqrt(np.diag(covariance)), np.zeros(covariance.shape)
+    order = np.argsort(sd, kind="stable")
+    scaled = (covariance / np.outer(sd, sd))[np.ix_(order, order)]
+    found[order] = sd[order, None] * np.linalg.cholesky(0.5 * (scaled + scaled.T) + RIDGE * np.eye(len(sd)))
+    return found
