@@ -19,6 +19,7 @@ from palpate.mechanics.solvers.conjugate_gradients import Product, conjugate_gra
 from palpate.mechanics.solvers.contract import Factorisation
 from palpate.mechanics.solvers.registry import SOLVERS, CheckedFactorisation
 from palpate.mesh.space import Constraint
+from palpate.parallel import mapped
 
 SERIES = 40  # largest number of vectors of a series
 FAR = 30.0  # largest over smallest ratio of moduli to the factorised ones, beyond which factorising anew is cheaper
@@ -320,18 +321,21 @@ def _corrected(found: Sequence[_Missing], near: LinearSystem) -> list[ReducedBas
             every, _ = conjugate_gradients(product, rhs, nearly, tolerance=np.array(tolerances), max_iterations=steps)
         return np.split(every, ends, axis=1)
 
-    loads = [of.loads(None if exact else product) for of in found]
+    loads = mapped(lambda of: of.loads(None if exact else product), found)
     missing = solved(loads, [tolerance for of in found for tolerance in of.tolerances])
     del loads
-    further = [of.further_loads(own) for of, own in zip(found, missing, strict=True)]
+    further = mapped(lambda pair: pair[0].further_loads(pair[1]), zip(found, missing, strict=True))
     later = solved(further, [TANGENT] * sum(of.shape[1] for of in further))
-    sharper = list[ReducedBasis]()
-    for of, own, more in zip(found, missing, later, strict=True):
+
+    def corrected(of: tuple[_Missing, NDArray[np.float64], NDArray[np.float64]]) -> ReducedBasis:
+        """One of the bases with what it missed, and what follows from that."""
+        asked, own, more = of
         if more.shape[1]:
-            own[:, of.new :] += more
-        cost = SolveCounts(forward=of.new, tangent=of.along.shape[1] + more.shape[1])
-        sharper.append(of.corrected(near, own, cost))
-    return sharper
+            own[:, asked.new :] += more
+        cost = SolveCounts(forward=asked.new, tangent=asked.along.shape[1] + more.shape[1])
+        return asked.corrected(near, own, cost)
+
+    return mapped(corrected, zip(found, missing, later, strict=True))
 
 
 def _near(found: Sequence[_Missing]) -> tuple[LinearSystem, bool]:

@@ -12,7 +12,7 @@ from palpate.inversion.later_state import InverseProblem, LaterState
 from palpate.inversion.mixture import Mixture
 from palpate.inversion.objective import Evaluation, Objective
 from palpate.inversion.optimise import Bounds, Minimum, same_minimum
-from palpate.inversion.search import REPORTED, ROUGH, Searched, StopRule, approached, begun, searched
+from palpate.inversion.search import REPORTED, ROUGH, Searched, StopRule, approached, begun, likely_minima, searched
 from palpate.inversion.starts import StartRun, informed_start, started
 from palpate.mechanics.forward import SolveCounts
 from palpate.parallel import blas_on_one_thread
@@ -81,13 +81,14 @@ def invert(
     near = searched(start, bounds, ROUGH if finite else rule, progress=progress, title="linear law")
     progress(f"{len(settings.every_start)} starts, with the closest points there")
     runs = started(near.cheapest(), near.minimum.unknowns, settings.every_start, bounds)
-    others = [
+    distinct = [
         run.minimum.unknowns
         for i, run in enumerate(runs)
         if run.minimum.converged
         and not same_minimum(run.minimum.unknowns, near.posterior.minimum, n)
         and run.candidate not in [other.candidate for other in runs[:i]]
     ]
+    others = likely_minima(near, distinct, bounds)
     if finite:
         best = near.objective.parameters.in_words(near.minimum.unknowns)
         progress(Line(f"{best} by the linear law; now at finite strain", "check the law"))

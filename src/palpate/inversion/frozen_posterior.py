@@ -12,7 +12,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.inversion.objective import Evaluation, Linearisation, Objective
@@ -21,7 +20,7 @@ from palpate.mechanics.curved import CurvedModel
 from palpate.mechanics.first_order import FirstOrderModel
 from palpate.mechanics.forward import ForwardModel
 from palpate.mechanics.reduced import ReducedModel, common_vectors
-from palpate.mechanics.solvers.cholesky import forward, lower_factor
+from palpate.mechanics.solvers.cholesky import adjoint_product, forward, lower_factor
 from palpate.observation.jacobian import Jacobian
 from palpate.unknowns.parameters import ParameterMap
 
@@ -144,7 +143,7 @@ class FrozenState:
         factor = lower_factor(own)
         beside = np.ascontiguousarray(forward(factor, across).T)
         left = form[m:-1, m:-1] - beside @ beside.T
-        return cls(reduced, expanded, form, square, np.asfortranarray(factor.T), beside, left, common)
+        return cls(reduced, expanded, form, square, factor, beside, left, common)
 
     def pulled(self, pull: NDArray[np.float64]) -> FrozenState:
         """The same with a form that is z^T y larger, y = `pull` (k - 1,) by all coordinates but the last."""
@@ -185,7 +184,7 @@ class FrozenState:
         It is Z^T Z + B^T Q_l B with Z = R_a A + R_l B, R_a triangular, and B is of zeros and ones but for ln E.
         """
         half = self._by_others(self.beside, modulus_slopes)
-        half[: amplitude_slopes.shape[1]] += linalg.blas.dtrmm(1.0, self.root, amplitude_slopes).T
+        half[: amplitude_slopes.shape[1]] += adjoint_product(self.root, amplitude_slopes).T
         found = self._of_others(self.left, modulus_slopes)
         found += half @ half.T
         return found

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from palpate.inversion.frozen_posterior import Posterior
 from palpate.inversion.objective import Evaluation
 from palpate.inversion.optimise import Bounds, Minimum, Outcome
+from palpate.parallel import mapped
 from palpate.unknowns.parameters import ParameterMap, Volume
 
 ASIDE, FURTHEST = 1.0, 0.4  # from a place to either side: standard deviations of J, and ln E at most
 LEAST = 0.25  # curvature of M over that of J by the Gauss-Newton matrix: of less, that of J counts
-PLACES, NEAR = 8, 0.1  # at most; a step of fewer standard deviations from one leads to the minimum
+NEAR = 0.1  # a step of fewer standard deviations from a place leads to the minimum
 AT_ONCE = 0.8  # of ln E: a longer step is cut
 RIDGE = 1e-12  # of correlations, which prevents a singular matrix
 
@@ -41,7 +42,7 @@ class MarginalMinimum:
 
 
 def marginal_minimum(
-    posterior: Posterior, unknowns: NDArray[np.float64], bounds: Bounds, places: int = PLACES
+    posterior: Posterior, unknowns: NDArray[np.float64], bounds: Bounds, places: int
 ) -> tuple[MarginalMinimum, Nearby]:
     """The minimum of M, sought from unknowns (n_unknowns,) within bounds, and what is known around it.
 
@@ -88,34 +89,23 @@ class Nearby:
         n, centre = posterior.n_parameters, posterior(unknowns)
         seen = np.flatnonzero(centre.matrix.diagonal[:n] > 0.0)
         moved = np.concatenate([seen, posterior.parameters.free_on_moduli])
-        unit = np.zeros((len(unknowns), len(moved)))
-        unit[moved, np.arange(len(moved))] = 1.0
-        axes = _root(centre.matrix.grounded().solve(unit)[moved])
+        axes = _root(_covariance(centre, moved))
         longest = np.abs(axes[: len(seen)])
         room = bounds.room[seen, None] / np.sqrt(12.0)
         steps = np.minimum(ASIDE, FURTHEST / np.maximum(longest.max(axis=0, initial=0.0), FURTHEST))
         places = np.repeat(unknowns[None], 1 + 2 * len(moved), axis=0)
         aside = (axes * steps).T
         places[1:, moved] += np.concatenate([aside, -aside])
-        evaluations = (centre, *(posterior(place) for place in places[1:]))
+        evaluations = (centre, *mapped(posterior, places[1:]))
         return cls(moved, axes, steps, np.any(longest > room, axis=0), places, evaluations)
 
     def parabola(self, parameters: ParameterMap) -> Parabola:
         """M around the place under a prior of the unknowns."""
-        values, rooms, best = list[float](), list[float](), list[NDArray[np.float64]]()
-        parameters, centre = replace(parameters, volume=None), self.places[0]
-        others = np.ones(self.places.shape[1], dtype=bool)
-        others[self.moved] = False
-        others[: parameters.n_parameters] = False
-        for place, seen in zip(self.places, self.evaluations, strict=True):
-            there = seen.under(parameters, place)
-            room, step = _followed(there, others)
-            values.append(there.value + 0.5 * float(there.score[others] @ step))
-            rooms.append(room)
-            best.append(place.copy())
-            best[-1][others] += step
-        n, twice = len(self.moved), 2.0 * self.steps
-        of, room = np.array(values), np.array(rooms)
+        n, twice, others = len(self.moved), 2.0 * self.steps, self._others(parameters.n_parameters)
+        parameters = replace(parameters, volume=None)
+        pairs = zip(self.places, self.evaluations, strict=True)
+        every = [_Followed.of(seen.under(parameters, place), place, others) for place, seen in pairs]
+        least, room = np.array([of.least for of in every]), np.array([of.room for of in every])
 
         def slopes(of: NDArray[np.float64]) -> NDArray[np.float64]:
             """By differences of both sides."""
@@ -126,55 +116,38 @@ class Nearby:
             return np.asarray((of[1 : n + 1] + of[n + 1 :] - 2.0 * of[0]) / self.steps**2)
 
         told = ~self.open  # on a plain any slope of the room would lead to a bound
-        slope, bend = slopes(of) + told * slopes(room), curvatures(of) + told * curvatures(room)
-        squared = self._schur(self.evaluations[0].under(parameters, centre))
-        own = np.sqrt(np.diag(squared))
-        length = np.sqrt(np.where(told & (bend > LEAST * own**2), bend, own**2)) / own
-        follow = (np.stack(best[1 : n + 1]) - np.stack(best[n + 1 :])).T / twice if n else np.zeros((len(best[0]), 0))
-        return Parabola(
-            self.moved,
-            self.axes,
-            of[0] + room[0],
-            slope,
-            length[:, None] * squared * length,
-            told * slopes(room),
-            best[0],
-            follow,
-        )
+        slope, bend = slopes(least) + told * slopes(room), curvatures(least) + told * curvatures(room)
+        centre, inverse = self.evaluations[0].under(parameters, self.places[0]), np.linalg.inv(self.axes)
+        gauss_newton = np.linalg.inv(inverse @ _covariance(centre, self.moved) @ inverse.T)
+        own = np.diag(gauss_newton)
+        longer = np.sqrt(np.where(told & (bend > LEAST * own), bend, own) / own)
+        best = np.stack([of.best for of in every])
+        follow = (best[1 : n + 1] - best[n + 1 :]).T / twice
+        bend = longer[:, None] * gauss_newton * longer
+        return Parabola(self.moved, self.axes, least[0] + room[0], slope, bend, told * slopes(room), best[0], follow)
 
-    def _schur(self, there: Evaluation) -> NDArray[np.float64]:
-        """U^T S U (n, n) of an evaluation at the centre, under any prior."""
-        unit = np.zeros((there.matrix.size, len(self.moved)))
-        unit[self.moved, np.arange(len(self.moved))] = 1.0
-        inverse = np.linalg.inv(self.axes)
-        return np.asarray(np.linalg.inv(inverse @ there.matrix.grounded().solve(unit)[self.moved] @ inverse.T))
+    def _others(self, n_parameters: int) -> NDArray[np.bool_]:
+        """Which unknowns (n_unknowns,) are integrated out; a log-modulus that moves nothing is neither."""
+        others = np.arange(self.places.shape[1]) >= n_parameters
+        others[self.moved] = False
+        return others
 
     def at_minimum(
         self, posterior: Posterior, unknowns: NDArray[np.float64], parabola: Parabola, outcome: Outcome
     ) -> MarginalMinimum:
         """What is stated of M at its minimum with a posterior, unknowns (n_unknowns,)."""
-        n, inverse = posterior.n_parameters, np.linalg.inv(self.axes)
-        slope = np.zeros(n + len(posterior.parameters.free_on_moduli))
-        seen = len(self.moved) - (len(slope) - n)
-        slope[self.moved[:seen]], slope[n:] = np.split(inverse.T @ parabola.room, [seen])
-        numbers = posterior.parameters.free_on_moduli
-        volume = Volume(slope, np.concatenate([unknowns[:n], unknowns[numbers]]), numbers)
-        own = posterior.believing(replace(posterior.parameters, volume=volume))
-        there = own(unknowns)
-        others = np.ones(len(unknowns), dtype=bool)
-        others[self.moved] = False
-        others[:n] = False
-        room, step = _followed(there, others)
-        at = unknowns.copy()
-        at[others] += step
-        value = there.value - volume.at(volume.of(unknowns))[0] + 0.5 * float(there.score[others] @ step) + room
-        log_det = float(np.linalg.slogdet(parabola.bend)[1]) - 2.0 * float(np.linalg.slogdet(self.axes)[1])
-        covariance = np.diag(np.full(n, np.inf))
+        n, numbers = posterior.n_parameters, posterior.parameters.free_on_moduli
+        seen, room = len(self.moved) - len(numbers), np.linalg.solve(self.axes.T, parabola.room)
+        slope, covariance = np.zeros(n), np.diag(np.full(n, np.inf))
+        slope[self.moved[:seen]] = room[:seen]
+        volume = Volume(np.append(slope, room[seen:]), np.append(unknowns[:n], unknowns[numbers]), numbers)
+        there = posterior.believing(replace(posterior.parameters, volume=volume))(unknowns)
+        found = _Followed.of(there, unknowns, self._others(n))
         of_t = self.axes @ np.linalg.solve(parabola.bend, self.axes.T)
         covariance[np.ix_(self.moved[:seen], self.moved[:seen])] = of_t[:seen, :seen]
-        return MarginalMinimum(
-            Minimum(at, there, outcome, (), len(self.evaluations) + 1), covariance, value + 0.5 * log_det, volume
-        )
+        value = found.least + found.room - volume.at(volume.of(unknowns))[0] - 0.5 * float(np.linalg.slogdet(of_t)[1])
+        minimum = Minimum(found.best, there, outcome, (), len(self.evaluations) + 1)
+        return MarginalMinimum(minimum, covariance, value, volume)
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,14 +193,30 @@ class Parabola:
         return at, float(np.abs(away).max(initial=0.0))
 
 
-def _followed(there: Evaluation, others: NDArray[np.bool_]) -> tuple[float, NDArray[np.float64]]:
-    """1/2 ln det H_yy, and the step (n_y,) of all unknowns that are among the `others` to their best."""
-    matrix = there.matrix.among(others).grounded()
-    eliminated = matrix.eliminated()
-    halves, right = eliminated.right(-there.score[others])
-    of_images = sum(float(np.log(np.diag(factor)).sum()) for factor in eliminated.factors)
-    room = of_images + 0.5 * float(np.linalg.slogdet(eliminated.left)[1])
-    return room, eliminated.followed(halves, np.linalg.solve(eliminated.left, right))
+@dataclass(frozen=True, slots=True)
+class _Followed:
+    """J with some unknowns at their best, all unknowns (n_unknowns,) there, and 1/2 ln det H_yy of these."""
+
+    least: float
+    best: NDArray[np.float64]
+    room: float
+
+    @classmethod
+    def of(cls, there: Evaluation, unknowns: NDArray[np.float64], others: NDArray[np.bool_]) -> _Followed:
+        """That of an evaluation at unknowns (n_unknowns,) whose `others` (n_unknowns,) follow: J is a parabola."""
+        matrix, score, best = there.matrix.among(others).grounded(), there.score[others], unknowns.copy()
+        eliminated = matrix.eliminated()
+        halves, right = eliminated.right(-score)
+        step = eliminated.followed(halves, np.asarray(np.linalg.solve(eliminated.left, right)))
+        best[others] += step
+        return cls(there.value + 0.5 * float(score @ step), best, 0.5 * eliminated.log_determinant())
+
+
+def _covariance(there: Evaluation, numbers: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Of unknowns with these numbers (n,), all others at their best: (n, n), by the Gauss-Newton matrix."""
+    unit = np.zeros((there.matrix.size, len(numbers)))
+    unit[numbers, np.arange(len(numbers))] = 1.0
+    return np.asarray(there.matrix.grounded().solve(unit)[numbers])
 
 
 def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

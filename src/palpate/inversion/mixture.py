@@ -32,7 +32,8 @@ TRUSTED_SD = 0.5  # of ln E: how far residuals are taken for linear where explan
 SEEN = 6.0  # of the log-evidence: explanations that are less likely than the best one by so much are left out
 MOST = 12  # explanations of a group whose minimum is sought on the model
 ROUNDS = 4  # over all images, to find the likeliest alternatives of each
-BESIDE = 1.0  # standard deviations from where a scenario's likeliest explanation lies to another one's minimum
+PLACES = 8  # at most, from one to the next of which the minimum of an explanation is sought
+BESIDE = 1.0  # standard deviations: so near the minimum of another explanation one is seen with what is known there
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,12 +132,14 @@ class Mixture:
 class Candidates:
     """The explanations that are compared: those of the scenarios that are `kept`.
 
-    The minima of the likeliest are sought, `most` at most, and `of_group` of one group where that is a number.
+    The minima of the likeliest are sought, `most` at most, and `of_group` of one group where that is a number, from so
+    many `places`.
     """
 
     kept: Callable[[Alternatives], bool] = lambda _: True
     most: int = MOST
     of_group: int | None = None
+    places: int = PLACES
 
 
 EVERY = Candidates()
@@ -164,21 +167,30 @@ def mixture_of(
     with determined():
         compared = LinearEvidence.of(posterior.parameters, evaluation, unknowns).compared(candidates)
     known = {of.key: of.minimum.unknowns for of in (earlier.explanations if earlier else ())}
-    first = {of.scenario.chosen: of for of in reversed(compared)}  # the likeliest of each scenario
-    begin = {key: known.get((0, tuple(sorted(of.chosen))), of.unknowns) for key, of in first.items()}
-    led = dict(zip(first, mapped(lambda key: _laplace(posterior, bounds, first[key], begin[key]), first), strict=True))
+    first = dict[tuple[int, ...], _Compared]()  # the likeliest of those in which the same unknowns act on moduli
+    for of in compared:
+        first.setdefault(_free(posterior.parameters, of), of)
+
+    def sought(of: _Compared) -> _Laplace | None:
+        """That whose minimum is sought from where it was, or where it is as far as residuals are linear."""
+        begin = known.get((0, tuple(sorted(of.chosen))), of.unknowns)
+        return _laplace(posterior, bounds, of, begin, candidates.places)
+
+    led = dict(zip(first, mapped(sought, first.values()), strict=True))
 
     def beside(of: _Compared) -> _Laplace | None:
-        """That of another explanation of a scenario, seen from where the likeliest one led."""
-        leads = led[of.scenario.chosen]
-        return None if leads is None else _laplace_beside(posterior, bounds, of, leads)
+        """That of another explanation, seen from where the likeliest one led, or found on its own."""
+        leads = led[_free(posterior.parameters, of)]
+        seen = None if leads is None else _laplace_beside(posterior, bounds, of, leads)
+        return seen or sought(of)
 
-    others = [of for of in compared if of is not first[of.scenario.chosen]]
-    found = [each for each in (*led.values(), *mapped(beside, others)) if each is not None]
+    rest = [of for of in compared if all(of is not other for other in first.values())]
+    found = [each for each in (*led.values(), *mapped(beside, rest)) if each is not None]
     if not found:
         raise EstimationError("the model cannot be solved near any explanation of the images; check images and mesh")
     likeliest = max(found, key=lambda each: each.level)
-    for each in mapped(lambda place: _laplace(posterior, bounds, likeliest.of, place), begins):
+    others = [(posterior, bounds, likeliest.of, begin, candidates.places) for begin in begins]
+    for each in mapped(lambda job: _laplace(*job), others):
         same = [other.found.minimum for other in found if other.of is likeliest.of]
         if each is not None and not any(same_minimum(each.found.minimum.unknowns, other, n) for other in same):
             found.append(each)
@@ -229,27 +241,35 @@ class _Laplace:
     level: float
 
 
-def _laplace(posterior: Posterior, bounds: Bounds, of: _Compared, begin: NDArray[np.float64]) -> _Laplace | None:
+def _laplace(
+    posterior: Posterior, bounds: Bounds, of: _Compared, begin: NDArray[np.float64], places: int
+) -> _Laplace | None:
     """An explanation, its minimum sought from unknowns (n_unknowns,); None where the model cannot be solved there."""
     own = posterior.believing(replace(posterior.parameters.choosing(dict(of.chosen)), volume=None))
     try:
-        found, nearby = marginal_minimum(own, begin, bounds)
+        found, nearby = marginal_minimum(own, begin, bounds, places)
     except SolverError:
         return None
     return _levelled(own.parameters, bounds, of, found, nearby)
 
 
 def _laplace_beside(posterior: Posterior, bounds: Bounds, of: _Compared, leads: _Laplace) -> _Laplace | None:
-    """An explanation of the same scenario as another one, with what is known around that one's minimum."""
+    """An explanation with what is known around the minimum of another one; None where its own is too far from there."""
     own = posterior.believing(replace(posterior.parameters.choosing(dict(of.chosen)), volume=None))
     parabola = leads.nearby.parabola(own.parameters)
     target, away = parabola.minimum(bounds)
-    outcome = Outcome.CONVERGED if away < BESIDE else Outcome.STEPS
+    if away > BESIDE:
+        return None
     try:
-        found = leads.nearby.at_minimum(own, target, parabola, outcome)
+        found = leads.nearby.at_minimum(own, target, parabola, Outcome.CONVERGED)
     except SolverError:
         return None
     return _levelled(own.parameters, bounds, of, found, leads.nearby)
+
+
+def _free(parameters: ParameterMap, of: _Compared) -> tuple[int, ...]:
+    """Numbers of the unknowns beside theta that act on moduli under an explanation."""
+    return tuple(parameters.choosing(dict(of.chosen)).free_on_moduli.tolist())
 
 
 def _levelled(

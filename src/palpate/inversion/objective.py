@@ -207,8 +207,8 @@ class Objective:
 
     def __call__(self, unknowns: NDArray[np.float64]) -> Evaluation:
         """J with score, Gauss-Newton matrix and residuals at `unknowns` (n_unknowns,)."""
-        found = [term for s in range(len(self.states)) for term in self._linearised(s, unknowns)]
-        return self.assembled(unknowns, found)
+        found = mapped(lambda s: self._linearised(s, unknowns), range(len(self.states)))
+        return self.assembled(unknowns, list(itertools.chain.from_iterable(found)))
 
     def assembled(self, unknowns: NDArray[np.float64], linearisations: Sequence[Linearisation]) -> Evaluation:
         """The evaluation at `unknowns` (n_unknowns,) from all observations' residuals there, with their derivatives."""

@@ -16,12 +16,14 @@ from palpate.approximation.expansion import Expansion
 from palpate.errors import EstimationError, NotConverged, SolverError
 from palpate.inversion.frozen_posterior import Posterior, cheapest_posterior
 from palpate.inversion.hyper_parameters import with_amplitudes, with_correlations, with_scales
-from palpate.inversion.mixture import MOST, Candidates, Mixture, mixture_of
+from palpate.inversion.laplace import MarginalMinimum, marginal_minimum
+from palpate.inversion.mixture import PLACES, Candidates, Mixture, mixture_of
 from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
-from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, gauss_newton
+from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, gauss_newton, same_minimum
 from palpate.inversion.scenarios import Alternatives, scenarios_of
 from palpate.mechanics.equilibrium import ACCURACY
 from palpate.mechanics.forward import SolveCounts
+from palpate.parallel import mapped
 from palpate.progress import Progress
 from palpate.unknowns.blocks import Choice
 
@@ -36,6 +38,7 @@ PATIENCE = 3  # iterations after which it is where a step was no longer than one
 CALM = 0.8  # of ln of what residuals weigh: a change with which the noise still follows the search
 FREE = 2, 4  # first iterations, at least and at most, of homogeneous tissues, in which the frame may move or not
 FAR_MOST, OF_RIVALS = 4, 2  # explanations that are compared on the way; those of each other group
+FAR_PLACES = 3  # far from its end, or of a rival, of the search for the minimum of an explanation
 RIVAL = 3.0  # of the log-evidence: groups less likely by so much, as the likeliest one sees them, are left out
 FOLLOWED = 4  # iterations in which a rival is followed
 CHANGES = 2  # of the likeliest group, after which the search ends
@@ -204,7 +207,8 @@ def _rivals(now: Searched, bounds: Bounds) -> Iterator[Searched]:
 
     if not any(map(kept, scenarios_of(now.frozen.parameters.blocks))):
         return
-    seen = mixture_of(now.frozen, at.unknowns, at.evaluation, near, Candidates(kept, of_group=OF_RIVALS))
+    some = Candidates(kept, of_group=OF_RIVALS, places=FAR_PLACES)
+    seen = mixture_of(now.frozen, at.unknowns, at.evaluation, near, some)
     found = set[tuple[str, ...]]()
     for of in seen.explanations:
         if of.level > now.posterior.level - RIVAL and of.group not in found:
@@ -213,6 +217,29 @@ def _rivals(now: Searched, bounds: Bounds) -> Iterator[Searched]:
             objective = now.objective.believing(of.prior(now.objective.parameters))
             before = replace(now, objective=objective, mixture=own, group=of.group, moved=np.inf)
             yield _taken(before, at.evaluation, of.minimum.unknowns)
+
+
+def likely_minima(now: Searched, begins: Sequence[NDArray[np.float64]], bounds: Bounds) -> list[NDArray[np.float64]]:
+    """Further minima (n_unknowns,) of the likeliest explanation that may be likely, each sought from one of `begins`.
+
+    As they are seen from where a search has ended; the others would cost as much as a search.
+    """
+    if now.frozen is None or not begins:
+        return []
+    n, likeliest = now.objective.n_parameters, now.posterior.explanations[0]
+    own = now.frozen.believing(replace(likeliest.prior(now.frozen.parameters), volume=None))
+
+    def of(begin: NDArray[np.float64]) -> MarginalMinimum | None:
+        """That which is found from there; None where the model cannot be solved."""
+        try:
+            return marginal_minimum(own, begin, bounds, PLACES)[0]
+        except SolverError:
+            return None
+
+    least, *found = mapped(of, [likeliest.minimum.unknowns, *begins])
+    assert least is not None, "the model was solved where the search ended"
+    likely = [each.minimum for each in found if each is not None and each.value < least.value + RIVAL]
+    return [each.unknowns for each in likely if not same_minimum(each.unknowns, least.minimum, n)]
 
 
 def _ended(now: Searched, mixture: Mixture, bounds: Bounds) -> Searched:
@@ -258,7 +285,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         return not any(k for i, k in scenario.chosen if blocks[i].choice is Choice.PATCHINESS)
 
     exact = now.moved < 1.0
-    own = Candidates(kept, MOST if exact else FAR_MOST)
+    own = Candidates(kept) if exact else Candidates(kept, FAR_MOST, places=FAR_PLACES)
     mixture = mixture_of(posterior, at.unknowns, evaluation, near, own, begins=begins, earlier=now.mixture)
     objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)

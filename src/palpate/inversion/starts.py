@@ -29,6 +29,7 @@ from palpate.mechanics.reduced import Projection, free_combinations, projection
 from palpate.parallel import mapped
 from palpate.progress import Progress
 from palpate.unknowns.blocks import FIELD, Acts, Block, Choice
+from palpate.unknowns.parameters import ParameterMap
 
 SCREENED = 0.01  # decrement at which the minimum of a start ends
 LEFT_OUT, LEFT_OUT_OF_MAP = 0.5, 0.2  # variances of the noise that what is left out may explain; of a map
@@ -88,9 +89,10 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
     objective = replace(start, states=tuple(states), parameters=still).rematched(begin)
     fitted = fit_coefficients(objective, begin)
     progress("what the images tell about each unknown")
-    for s, (state, q) in enumerate(zip(objective.states, parameters.coefficients(fitted.unknowns), strict=True)):
-        found[s] = found[s].with_material(q)
-        states[s] = replace(state, observed=found[s].seen(state, q))
+    motions = parameters.coefficients(fitted.unknowns)
+    found = mapped(lambda pair: pair[0].with_material(pair[1]), zip(found, motions, strict=True))
+    every = zip(objective.states, found, motions, strict=True)
+    states = mapped(lambda of: replace(of[0], observed=of[1].seen(of[0], of[2])), every)
     shown = with_scales(with_correlations(objective, fitted.evaluation), fitted.evaluation)
     states = [replace(of, observed=own.observed) for of, own in zip(shown.states, states, strict=True)]
     evaluation = replace(objective, states=tuple(states))(fitted.unknowns)
@@ -98,38 +100,60 @@ def informed_start(problem: InverseProblem, theta: NDArray[np.float64], *, progr
     data = evaluation.matrix - still.prior_of_blocks  # what earlier images tell, too
     middle, evaluations = fitted.unknowns, fitted.evaluations + 1
     # free the large derivatives of everything observed by all unknowns
-    del objective, shown, states, state, fitted, evaluation
+    del objective, shown, states, fitted, evaluation
     informations = [data.block(own, own) for own in columns]
     bases = _combinations(parameters.blocks, informations, [state.model for state in start.states])
     fit = [inverse @ middle[own] for own, (_, inverse) in zip(columns, bases, strict=True)]
     unknowns = np.concatenate([theta, *fit])
-    seen, informed = parameters.combined([inverse for _, inverse in bases]), list[LaterState]()
-    made = list[_Made]()
+    seen = parameters.combined([inverse for _, inverse in bases])
     progress(f"how the responses to the {seen.n_coefficients} unknowns that the images show change with the moduli")
-    for s, (state, q) in enumerate(zip(start.states, seen.coefficients(unknowns), strict=True)):
-        of_state = [(b.acts, basis) for b, (basis, _) in zip(parameters.blocks, bases, strict=True) if s in b.states]
+    informed = _on_bases(start.states, found, bases, seen, unknowns)
+    return begun(Objective(informed, seen), unknowns, evaluations=evaluations)
+
+
+def _on_bases(
+    states: Sequence[LaterState],
+    found: Sequence[_Responses],
+    bases: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
+    seen: ParameterMap,
+    unknowns: NDArray[np.float64],
+) -> tuple[LaterState, ...]:
+    """The states on reduced bases of their responses, at unknowns (n_unknowns,) of the map that is `seen`.
+
+    found: the responses; bases: the combinations of each block, and their inverse.
+    """
+    made, asked = list[_Made](), list[tuple[LaterState, _Responses, Projection, NDArray[np.float64]]]()
+    stiffer = unknowns.copy()
+    stiffer[: seen.n_parameters] += APART
+    for s, state in enumerate(states):
+        of_state = [(b, basis) for b, (basis, _) in zip(seen.blocks, bases, strict=True) if s in b.states]
         boundary, material = (
-            linalg.block_diag(np.zeros((0, 0)), *(basis for acts, basis in of_state if acts is wanted))
+            linalg.block_diag(np.zeros((0, 0)), *(basis for b, basis in of_state if b.acts is wanted))
             for wanted in (Acts.BOUNDARY, Acts.MATERIAL)
         )
-        n_poisson = len(state.model.material.poisson)
-        fields = material[: material.shape[0] - n_poisson, : material.shape[1] - n_poisson]
+        n = len(state.model.material.poisson)
+        fields = material[: material.shape[0] - n, : material.shape[1] - n]
         modes = state.model.constraint.modes
         like = next((of for of in made if of.modes is modes and np.array_equal(of.boundary, boundary)), None)
-        pairs = zip(parameters.blocks, bases, strict=True)
-        at_rest = {b.of: basis for b, (basis, _) in pairs if b.acts is Acts.REFERENCE and s in b.states}
+        at_rest = {b.of: basis for b, basis in of_state if b.acts is Acts.REFERENCE}
         reduced = state.combined(boundary, fields, at_rest, like.projection.model if like else None)
-        responses = found.pop(0)
-        if like:
-            projected = like.projection.under(reduced.model)
-        else:
-            stiffer = seen.moduli(np.concatenate([theta + APART, unknowns[len(theta) :]]))
-            projected = responses.projected(reduced.model, boundary)
-            projected = projected.extended(_free_responses(reduced.model, stiffer))
-        made += [] if like else [_Made(modes, boundary, projected)]
-        basis = responses.basis(projected, material)
-        informed.append(reduced.with_approximation(basis.with_modulus_series(q, seen.derivatives(unknowns))))
-    return begun(Objective(tuple(informed), seen), unknowns, evaluations=evaluations)
+        if like is None:
+            projected = found[s].projected(reduced.model, boundary)
+            projected = projected.extended(_free_responses(reduced.model, seen.moduli(stiffer)))
+            like = _Made(modes, boundary, projected)
+            made.append(like)
+        asked.append((reduced, found[s], like.projection, material))
+
+    def on_basis(
+        of: tuple[tuple[LaterState, _Responses, Projection, NDArray[np.float64]], NDArray[np.float64]],
+    ) -> LaterState:
+        """A state on its basis."""
+        (state, responses, projected, material), q = of
+        own = projected if projected.model is state.model else projected.under(state.model)
+        basis = responses.basis(own, material).with_modulus_series(q, seen.derivatives(unknowns))
+        return state.with_approximation(basis)
+
+    return tuple(mapped(on_basis, zip(asked, seen.coefficients(unknowns), strict=True)))
 
 
 def _responses(model: LinearModel, moduli: NDArray[np.float64], others: Sequence[_Responses]) -> _Responses:

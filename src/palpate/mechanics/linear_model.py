@@ -199,9 +199,10 @@ class LinearModel:
         return material_forces(self.elements, self.material, values, lame, by_poisson=slopes, tissue=tissue)
 
     def material_by_region(self, values: NDArray[np.float64]) -> tuple[MaterialForces, ...]:
-        """Those of each region alone, at 1 kPa."""
+        """Those of each region alone, at 1 kPa, of the elements in which a coefficient changes anything."""
         every, tissue = self.by_material(np.ones(self.n_regions), values), self.space.mesh.region
-        return tuple(every.of_cells(np.flatnonzero(tissue == region)) for region in self.regions)
+        changed = np.any([np.diff(amounts.indptr) > 0 for _, amounts in every.parts], axis=0)
+        return tuple(every.of_cells(np.flatnonzero((tissue == region) & changed)) for region in self.regions)
 
     def _lame(self, moduli: NDArray[np.float64], dilatation: Dilatation) -> tuple[Moduli, Moduli]:
         """Lame's constants (n_tets,) of all elements at moduli (n_regions,) kPa; their slopes by Poisson's ratio."""

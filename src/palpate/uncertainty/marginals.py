@@ -45,8 +45,9 @@ def stated_mixture(mixture: Mixture, own: Covariance, blocks: tuple[Block, ...])
     """A mixture whose explanations have the errors of the likeliest one, `own`, beside those of the posterior.
 
     Residuals are alike over surfaces in other ways than their number says: with the sandwich C_s and H^-1 of the
-    likeliest explanation, every standard deviation is larger by the factor (C_s / H^-1)^(1/2), 1 to `CORRELATED`. What blocks that are held, the voxels' place and the mesh add is the same in all. The variance is that
-    within explanations and that between their means (law of total variance). By how much it is larger than that of the
+    likeliest explanation, every standard deviation is larger by the factor (C_s / H^-1)^(1/2), 1 to `CORRELATED`. What
+    blocks that are held, the voxels' place and the mesh add is the same in all. The variance is that within
+    explanations and that between their means (law of total variance). By how much it is larger than that of the
     likeliest one is told by what distinguishes them.
     """
     held, factor = own.of_held, correlated_factor(own)

@@ -213,10 +213,8 @@ class Arrowhead:
         return eliminated.followed(halves, np.asarray(np.linalg.solve(eliminated.left, right)))
 
     def log_determinant(self) -> float:
-        """Ln det: of each D_k, and of what is left of the shared unknowns. Raises as `eliminated` does."""
-        eliminated = self.eliminated()
-        of_images = sum(2.0 * float(np.log(np.diag(factor)).sum()) for factor in eliminated.factors)
-        return of_images + float(np.linalg.slogdet(eliminated.left)[1])
+        """Ln det. Raises as `eliminated` does."""
+        return self.eliminated().log_determinant()
 
     def complement(
         self, numbers: NDArray[np.int64], rhs: NDArray[np.float64]
@@ -258,6 +256,11 @@ class Eliminated:
     factors: tuple[NDArray[np.float64], ...]
     borders: tuple[NDArray[np.float64], ...]
     left: NDArray[np.float64]
+
+    def log_determinant(self) -> float:
+        """Ln det: of each D_k, and of what is left of the shared unknowns."""
+        of_images = sum(2.0 * float(np.log(np.diag(factor)).sum()) for factor in self.factors)
+        return of_images + float(np.linalg.slogdet(self.left)[1])
 
     def right(self, rhs: NDArray[np.float64]) -> tuple[tuple[NDArray[np.float64], ...], NDArray[np.float64]]:
         """Of rhs b (n,) or (n, k): h_k = L_k^-1 b_k of each image, and b_s - sum_k B_k^T D_k^-1 b_k."""

@@ -31,8 +31,11 @@ __all__ = [
     "address",
     "blas_on_one_thread",
     "factor",
+    "multiply_adjoint",
     "pool_of",
     "processors",
+    "solve",
+    "solve_adjoint",
     "solve_right",
     "solve_transposed",
     "subtract_product",
@@ -61,7 +64,7 @@ _ROUTINES = {
     for letter, dtype in (("s", np.float32), ("d", np.float64))
     for kind, module in [
         ("potrf", cython_lapack),
-        *((k, cython_blas) for k in ("trsm", "syrk", "gemm", "trsv", "gemv")),
+        *((k, cython_blas) for k in ("trsm", "trmm", "syrk", "gemm", "trsv", "gemv")),
     ]
 }
 _TYPES = (np.dtype(np.float32), np.dtype(np.float64))
@@ -81,7 +84,7 @@ def _dimension(value: int) -> Any:
 
 
 def _leading(array: Matrix) -> Any:
-    return _dimension(max(array.strides[1] // array.itemsize, 1))
+    return _dimension(max(array.strides[1] // array.itemsize, array.shape[0], 1))  # a single column has any stride
 
 
 def _scalar(dtype: np.dtype[Any], value: float) -> int:
@@ -95,8 +98,8 @@ def factor(a: Matrix) -> int:
     return info.value
 
 
-def _triangular(side: bytes, transposed: bytes, lower: Matrix, b: Matrix) -> None:
-    _ROUTINES["trsm", b.dtype](
+def _triangular(side: bytes, transposed: bytes, lower: Matrix, b: Matrix, kind: str = "trsm") -> None:
+    _ROUTINES[kind, b.dtype](
         side, b"L", transposed, b"N", _dimension(b.shape[0]), _dimension(b.shape[1]), _scalar(b.dtype, 1.0),
         address(lower), _leading(lower), address(b), _leading(b),
     )  # fmt: skip
@@ -110,6 +113,21 @@ def solve_transposed(lower: Matrix, b: Matrix) -> None:
 def solve_right(lower: Matrix, b: Matrix) -> None:
     """B L^-1 in place of B (m, n)."""
     _triangular(b"R", b"N", lower, b)
+
+
+def solve(lower: Matrix, b: Matrix) -> None:
+    """L^-1 B in place of B (n, k)."""
+    _triangular(b"L", b"N", lower, b)
+
+
+def solve_adjoint(lower: Matrix, b: Matrix) -> None:
+    """L^-T B in place of B (n, k)."""
+    _triangular(b"L", b"T", lower, b)
+
+
+def multiply_adjoint(lower: Matrix, b: Matrix) -> None:
+    """L^T B in place of B (n, k)."""
+    _triangular(b"L", b"T", lower, b, "trmm")
 
 
 def subtract_square(c: Matrix, a: Matrix, *, keep: float = 1.0) -> None:
