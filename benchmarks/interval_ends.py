@@ -74,7 +74,7 @@ def with_all_responses(objective: Objective, place: NDArray[np.float64]) -> Obje
 def profiles(posterior: StatedPosterior, n_parameters: int, bounds: Bounds) -> list[Profile]:
     """Those of all moduli."""
     variances = np.diag(posterior.covariance).tolist()[:n_parameters]
-    of = (posterior.frozen, posterior.minimum)
+    of = (posterior.marginal, posterior.minimum)
     return [modulus_interval(*of, k, variance=variance, bounds=bounds).profile for k, variance in enumerate(variances)]
 
 

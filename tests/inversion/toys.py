@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -50,21 +50,6 @@ class Folding:
         if unknowns[-1] > self.most:
             raise SolverError("the motion turns elements inside out")
         return self.of(unknowns)
-
-
-@dataclass(frozen=True)
-class Uphill:
-    """Another objective, whose score is as wrong as can be: what seeks its minimum stays where it begins."""
-
-    of: object
-
-    @property
-    def n_parameters(self):
-        return self.of.n_parameters
-
-    def __call__(self, unknowns):
-        there = self.of(unknowns)
-        return replace(there, score=-100.0 * there.score)
 
 
 @dataclass(frozen=True)

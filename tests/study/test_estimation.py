@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from palpate.errors import SolverError
 from palpate.images.tissue import Role
 from palpate.inversion import REPORTED, Explanation, Inversion, Mixture, Outcome, frozen_posterior, gauss_newton, invert
 from palpate.mechanics.forward import SolveCounts
@@ -445,17 +446,33 @@ def test_an_interval_that_could_not_be_followed_says_so_and_blames_no_bound(inve
     minimum, covariance = inversion.minimum, estimation.covariance
     frozen = frozen_posterior(inversion.objective, minimum.unknowns, minimum.evaluation)
 
-    class Uphill:
-        n_parameters = frozen.n_parameters
+    posterior = as_stated(inversion, covariance, settings.bounds)
+    sd = np.sqrt(np.diag(posterior.covariance))
+
+    @dataclass(frozen=True)
+    class Brittle:
+        """Solved no further than one and a half standard deviations from the minimum."""
+
+        of: object = frozen
+
+        @property
+        def n_parameters(self):
+            return self.of.n_parameters
+
+        @property
+        def parameters(self):
+            return self.of.parameters
+
+        def believing(self, parameters):
+            return Brittle(self.of.believing(parameters))
 
         def __call__(self, unknowns):
-            there = frozen(unknowns)
-            return replace(there, score=-100.0 * there.score)
+            if np.any(np.abs(unknowns - minimum.unknowns)[:2] > 1.5 * sd):
+                raise SolverError("too far")
+            return self.of(unknowns)
 
-    posterior = as_stated(inversion, covariance, settings.bounds)
     assert all(of.followed for of in intervals_of(inversion, settings, posterior))
-    away = replace(minimum, unknowns=minimum.unknowns + 0.1)
-    lost = profiled(replace(posterior, frozen=Uphill(), minimum=away), settings.bounds)
+    lost = profiled(replace(posterior, frozen=Brittle()), settings.bounds)
     known = intervals_of(inversion, settings, lost)
     for found in estimates_of(inversion, known, covariance, truth={}):
         assert found.verdict == "not identified"

@@ -28,9 +28,12 @@ def inversion(twins, twin):
 
 @pytest.fixture(scope="module")
 def poor(inversion, twin):
-    """The objective on a basis of responses at the estimate alone, which bends little elsewhere."""
-    moduli = inversion.objective.parameters.moduli(inversion.minimum.unknowns)
-    return inversion.objective.under([reduced_basis(twin.model, moduli)])
+    """The objective on a basis of responses at the estimate and at stiffer moduli, of no displacement elsewhere."""
+    theta, mapping = inversion.minimum.unknowns, inversion.objective.parameters
+    basis, stiffer = reduced_basis(twin.model, mapping.moduli(theta)), theta + np.append([1.0, 1.0], 0.0 * theta[2:])
+    responses = twin.model.system(mapping.moduli(stiffer)).responses()[:, :-1]
+    free = np.asarray(twin.model.constraint.free.T @ responses)
+    return inversion.objective.under([replace(basis, projection=basis.projection.extended(free))])
 
 
 def posterior_of(objective, minimum):
@@ -44,7 +47,7 @@ def posterior_of(objective, minimum):
 def profiles(posterior, bounds):
     variances = np.diag(posterior.covariance)[:2]
     found = [
-        modulus_interval(posterior.frozen, posterior.minimum, k, variance=float(variance), bounds=bounds)
+        modulus_interval(posterior.marginal, posterior.minimum, k, variance=float(variance), bounds=bounds)
         for k, variance in enumerate(variances)
     ]
     return [of.profile for of in found]
@@ -72,10 +75,7 @@ def on_poor(request, poor, expansion):
 
 
 def test_profiles_end_where_those_of_the_full_model_do(inversion, poor, on_poor, bounds):
-    """A tenth of the half-width off at the most; those of a basis that was not asked there are further off.
-
-    Of an expansion lower ends alone: its own derivatives lead nearly as far upwards.
-    """
+    """A tenth of the half-width off at the most; one of a basis that was not asked there is further off."""
     before = posterior_of(on_poor, inversion.minimum)
     found, full = exact_at_ends(profiled(before, bounds), on_poor, bounds), poor
     for of in profiles(found, bounds):
@@ -85,7 +85,7 @@ def test_profiles_end_where_those_of_the_full_model_do(inversion, poor, on_poor,
     half = NORMAL_95 * np.sqrt(np.diag(found.covariance)[:2])[:, None]
     truth = ends(posterior_of(full, inversion.minimum), bounds)
     off = [np.abs(ends(of, bounds) - truth) / half for of in (before, found)]
-    assert (off[0] if on_poor is poor else off[0][:, 0]).min() > 0.1
+    assert on_poor is not poor or np.nanmax(off[0]) > 0.1
     assert off[1].max() < 0.1
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from palpate.inversion import Bounds, Evaluation, gauss_newton
+from palpate.inversion import Bounds, Evaluation, MarginalPosterior, gauss_newton
 from palpate.uncertainty.combinations import information, known_pairs
 from palpate.unknowns import Arrowhead
 
@@ -45,7 +45,8 @@ def parabola(covariance):
 
 def known(problem, covariance, within=2.0, start=THETA):
     minimum = gauss_newton(problem, start, bounds=WIDE, tolerance=1e-10)
-    return known_pairs(problem, minimum, NAMES, covariance, bounds=WIDE, within=within)
+    marginal = MarginalPosterior(problem, np.zeros(0, dtype=np.int64))
+    return known_pairs(marginal, minimum, NAMES, covariance, bounds=WIDE, within=within)
 
 
 def test_a_ratio_is_known_where_both_moduli_go_up_and_down_together():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from palpate.inversion import Bounds, Explanation, Mixture, fixed_correspondence
+from palpate.inversion import Bounds, Explanation, MarginalPosterior, Mixture, fixed_correspondence
 from palpate.uncertainty import (
     NORMAL_95,
     Covariance,
@@ -48,7 +48,7 @@ def test_without_a_profile_the_law_is_normal_in_the_logarithm():
 
 def test_the_quantiles_of_one_explanation_are_the_ends_of_its_profile(objective, minimum):
     """Of moduli that are known to a factor of two, whose profiles lean."""
-    fixed = fixed_correspondence(objective, minimum.unknowns, minimum.evaluation)
+    fixed = MarginalPosterior.of(fixed_correspondence(objective, minimum.unknowns, minimum.evaluation))
     for number, variance in enumerate(np.diag(minimum.evaluation.covariance_columns(2))):
         own = modulus_interval(fixed, minimum, number, variance=variance, bounds=WIDE)
         sd = float(np.sqrt(variance))

@@ -17,6 +17,8 @@ from palpate.inversion.frozen_posterior import pulls_of as pulls_of
 from palpate.inversion.hyper_parameters import with_correlations as with_correlations
 from palpate.inversion.hyper_parameters import with_first_noise as with_first_noise
 from palpate.inversion.hyper_parameters import with_scales as with_scales
+from palpate.inversion.laplace import MarginalMinimum as MarginalMinimum
+from palpate.inversion.laplace import MarginalPosterior as MarginalPosterior
 from palpate.inversion.later_state import InverseProblem as InverseProblem
 from palpate.inversion.later_state import LaterState as LaterState
 from palpate.inversion.mixture import Candidates as Candidates

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from palpate.inversion.frozen_posterior import Posterior
 from palpate.inversion.objective import Evaluation
-from palpate.inversion.optimise import Bounds, Minimum, Outcome
+from palpate.inversion.optimise import Bounds, LeastSquares, Minimum, Outcome
 from palpate.parallel import mapped
 from palpate.unknowns.parameters import ParameterMap, Volume
 
 ASIDE, FURTHEST = 1.0, 0.4  # from a place to either side: standard deviations of J, and ln E at most
 LEAST = 0.25  # curvature of M over that of J by the Gauss-Newton matrix: of less, that of J counts
+RISE = 0.1  # of M: a place where it is larger by more is too far
+PLACES = 16  # at most, from one to the next of which a minimum is sought
 NEAR = 0.1  # a step of fewer standard deviations from a place leads to the minimum
 AT_ONCE = 0.8  # of ln E: a longer step is cut
 RIDGE = 1e-12  # of correlations, which prevents a singular matrix
@@ -31,52 +33,76 @@ RIDGE = 1e-12  # of correlations, which prevents a singular matrix
 class MarginalMinimum:
     """The minimum of M, with all other unknowns at their best there.
 
-    covariance (n_parameters, n_parameters): of theta, infinite where it moves nothing; value: M + 1/2 ln det of its
-    second derivatives; volume: how 1/2 ln det H_yy changes with t there; the evaluation is with it.
+    least: M; covariance (n_parameters, n_parameters): of theta, infinite where it moves nothing, or where bounds hold
+    it; value: M + 1/2 ln det of its second derivatives; volume: how 1/2 ln det H_yy changes with t there.
     """
 
     minimum: Minimum
+    least: float
     covariance: NDArray[np.float64]
     value: float
     volume: Volume
 
 
-def marginal_minimum(
-    posterior: Posterior, unknowns: NDArray[np.float64], bounds: Bounds, places: int
-) -> tuple[MarginalMinimum, Nearby]:
-    """The minimum of M, sought from unknowns (n_unknowns,) within bounds, and what is known around it.
+@dataclass(frozen=True, slots=True)
+class MarginalPosterior:
+    """M of an objective J; on_moduli (n,): numbers of the unknowns beside theta that act on moduli."""
 
-    A step leads from each of some places to the minimum of the parabola there, half as far where M is no smaller.
-    Raises `SolverError` where the model cannot be solved.
-    """
-    at, before, best = unknowns.copy(), unknowns, np.inf
-    at[: posterior.n_parameters] = np.clip(at[: posterior.n_parameters], bounds.lower, bounds.upper)
-    for left in reversed(range(places)):
-        nearby = Nearby.of(posterior, at, bounds)
-        parabola = nearby.parabola(posterior.parameters)
-        if parabola.value > best + 1.0 and left:
-            at = 0.5 * (at + before)
-            continue
-        before, best = at, min(best, parabola.value)
-        target, away = parabola.minimum(bounds)
-        if away < NEAR:
-            break
-        at = target
-    outcome = Outcome.CONVERGED if away < NEAR else Outcome.STEPS
-    return nearby.at_minimum(posterior, target, parabola, outcome), nearby
+    objective: LeastSquares
+    on_moduli: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, posterior: Posterior) -> MarginalPosterior:
+        """That of a posterior, under its own prior."""
+        parameters = replace(posterior.parameters, volume=None)
+        return cls(posterior.believing(parameters), parameters.free_on_moduli)
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of log-moduli among the unknowns."""
+        return self.objective.n_parameters
+
+    def minimum(self, unknowns: NDArray[np.float64], bounds: Bounds, places: int = PLACES) -> MarginalMinimum:
+        """The minimum of M, sought from unknowns (n_unknowns,) within bounds; raises as `seen_at_minimum`."""
+        return self.seen_at_minimum(unknowns, bounds, places)[0]
+
+    def seen_at_minimum(
+        self, unknowns: NDArray[np.float64], bounds: Bounds, places: int = PLACES
+    ) -> tuple[MarginalMinimum, Nearby]:
+        """The minimum of M, and what is known around it.
+
+        A step leads from each of some places to the minimum of the parabola there, half as far where M is larger.
+        Raises `SolverError` where the model cannot be solved.
+        """
+        at, last = unknowns.copy(), None
+        at[: self.n_parameters] = np.clip(at[: self.n_parameters], bounds.lower, bounds.upper)
+        for left in reversed(range(places)):
+            nearby = Nearby.of(self, at, bounds)
+            parabola = nearby.parabola()
+            if last is not None and parabola.value > last.value + RISE and left:
+                at = 0.5 * (at + last.best)
+                continue
+            parabola = parabola if last is None else parabola.bent(last)
+            target, away = parabola.minimum(bounds)
+            if away < NEAR:
+                break
+            at, last = target, parabola
+        outcome = Outcome.CONVERGED if away < NEAR else Outcome.STEPS
+        return nearby.at_minimum(self, target, parabola, outcome), nearby
 
 
 @dataclass(frozen=True, slots=True)
 class Nearby:
-    """A posterior seen at a place and on either side of it along axes of t.
+    """M seen at a place and on either side of it along axes of t.
 
-    moved (n,): numbers of t among the unknowns; axes U (n, n): columns with U^T S U = 1, S the Schur complement of the
-    Gauss-Newton matrix, of what is known best first, which moves what is known less; steps (n,): how far along each;
-    open (n,): those so long that bounds cut them; places (1 + 2 n, n_unknowns) with their evaluations: the centre,
-    those before, and those behind.
+    moved (n,): numbers of t among the unknowns; others (n_unknowns,): which are integrated out, none of the log-moduli;
+    axes U (n, n): columns with U^T S U = 1, S the Schur complement of the Gauss-Newton matrix, of what is known best
+    first, which moves what is known less; steps (n,): how far along each; open (n,): those so long that bounds cut
+    them; places (1 + 2 n, n_unknowns) with their evaluations: the centre, those before, and those behind.
     """
 
     moved: NDArray[np.int64]
+    others: NDArray[np.bool_]
     axes: NDArray[np.float64]
     steps: NDArray[np.float64]
     open: NDArray[np.bool_]
@@ -84,11 +110,11 @@ class Nearby:
     evaluations: tuple[Evaluation, ...]
 
     @classmethod
-    def of(cls, posterior: Posterior, unknowns: NDArray[np.float64], bounds: Bounds) -> Nearby:
-        """It around unknowns (n_unknowns,), with the axes under the posterior's own prior."""
-        n, centre = posterior.n_parameters, posterior(unknowns)
-        seen = np.flatnonzero(centre.matrix.diagonal[:n] > 0.0)
-        moved = np.concatenate([seen, posterior.parameters.free_on_moduli])
+    def of(cls, marginal: MarginalPosterior, unknowns: NDArray[np.float64], bounds: Bounds) -> Nearby:
+        """It around unknowns (n_unknowns,), with the axes under its own prior."""
+        n, centre = marginal.n_parameters, marginal.objective(unknowns)
+        seen = np.flatnonzero((centre.matrix.diagonal[:n] > 0.0) & (bounds.upper > bounds.lower))
+        moved = np.concatenate([seen, marginal.on_moduli])
         axes = _root(_covariance(centre, moved))
         longest = np.abs(axes[: len(seen)])
         room = bounds.room[seen, None] / np.sqrt(12.0)
@@ -96,15 +122,21 @@ class Nearby:
         places = np.repeat(unknowns[None], 1 + 2 * len(moved), axis=0)
         aside = (axes * steps).T
         places[1:, moved] += np.concatenate([aside, -aside])
-        evaluations = (centre, *mapped(posterior, places[1:]))
-        return cls(moved, axes, steps, np.any(longest > room, axis=0), places, evaluations)
+        evaluations = (centre, *mapped(marginal.objective, places[1:]))
+        others = np.arange(len(unknowns)) >= n
+        others[moved] = False
+        return cls(moved, others, axes, steps, np.any(longest > room, axis=0), places, evaluations)
 
-    def parabola(self, parameters: ParameterMap) -> Parabola:
-        """M around the place under a prior of the unknowns."""
-        n, twice, others = len(self.moved), 2.0 * self.steps, self._others(parameters.n_parameters)
-        parameters = replace(parameters, volume=None)
+    def under(self, parameters: ParameterMap) -> Nearby:
+        """The same under another prior of the unknowns."""
         pairs = zip(self.places, self.evaluations, strict=True)
-        every = [_Followed.of(seen.under(parameters, place), place, others) for place, seen in pairs]
+        return replace(self, evaluations=tuple(seen.under(parameters, place) for place, seen in pairs))
+
+    def parabola(self) -> Parabola:
+        """M around the place."""
+        n, twice = len(self.moved), 2.0 * self.steps
+        pairs = zip(self.places, self.evaluations, strict=True)
+        every = [_Followed.of(seen, place, self.others) for place, seen in pairs]
         least, room = np.array([of.least for of in every]), np.array([of.room for of in every])
 
         def slopes(of: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -117,8 +149,8 @@ class Nearby:
 
         told = ~self.open  # on a plain any slope of the room would lead to a bound
         slope, bend = slopes(least) + told * slopes(room), curvatures(least) + told * curvatures(room)
-        centre, inverse = self.evaluations[0].under(parameters, self.places[0]), np.linalg.inv(self.axes)
-        gauss_newton = np.linalg.inv(inverse @ _covariance(centre, self.moved) @ inverse.T)
+        inverse = np.linalg.inv(self.axes)
+        gauss_newton = np.linalg.inv(inverse @ _covariance(self.evaluations[0], self.moved) @ inverse.T)
         own = np.diag(gauss_newton)
         longer = np.sqrt(np.where(told & (bend > LEAST * own), bend, own) / own)
         best = np.stack([of.best for of in every])
@@ -126,28 +158,22 @@ class Nearby:
         bend = longer[:, None] * gauss_newton * longer
         return Parabola(self.moved, self.axes, least[0] + room[0], slope, bend, told * slopes(room), best[0], follow)
 
-    def _others(self, n_parameters: int) -> NDArray[np.bool_]:
-        """Which unknowns (n_unknowns,) are integrated out; a log-modulus that moves nothing is neither."""
-        others = np.arange(self.places.shape[1]) >= n_parameters
-        others[self.moved] = False
-        return others
-
     def at_minimum(
-        self, posterior: Posterior, unknowns: NDArray[np.float64], parabola: Parabola, outcome: Outcome
+        self, marginal: MarginalPosterior, unknowns: NDArray[np.float64], parabola: Parabola, outcome: Outcome
     ) -> MarginalMinimum:
-        """What is stated of M at its minimum with a posterior, unknowns (n_unknowns,)."""
-        n, numbers = posterior.n_parameters, posterior.parameters.free_on_moduli
+        """What is stated of M at its minimum, unknowns (n_unknowns,)."""
+        n, numbers, there = marginal.n_parameters, marginal.on_moduli, marginal.objective(unknowns)
         seen, room = len(self.moved) - len(numbers), np.linalg.solve(self.axes.T, parabola.room)
         slope, covariance = np.zeros(n), np.diag(np.full(n, np.inf))
         slope[self.moved[:seen]] = room[:seen]
         volume = Volume(np.append(slope, room[seen:]), np.append(unknowns[:n], unknowns[numbers]), numbers)
-        there = posterior.believing(replace(posterior.parameters, volume=volume))(unknowns)
-        found = _Followed.of(there, unknowns, self._others(n))
+        found = _Followed.of(there, unknowns, self.others)
         of_t = self.axes @ np.linalg.solve(parabola.bend, self.axes.T)
         covariance[np.ix_(self.moved[:seen], self.moved[:seen])] = of_t[:seen, :seen]
-        value = found.least + found.room - volume.at(volume.of(unknowns))[0] - 0.5 * float(np.linalg.slogdet(of_t)[1])
+        least = found.least + found.room
         minimum = Minimum(found.best, there, outcome, (), len(self.evaluations) + 1)
-        return MarginalMinimum(minimum, covariance, value, volume)
+        value = least - 0.5 * float(np.linalg.slogdet(of_t)[1])
+        return MarginalMinimum(minimum, least, covariance, value, volume)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +181,6 @@ class Parabola:
     """M(U xi) = value + slope . xi + 1/2 xi . B xi along the axes U of t, B `bend`; the others `best` + `follow` xi.
 
     B (n, n) has the second differences of M on its diagonal, beside it the correlations of the Gauss-Newton matrix.
-
     room (n,): the part of the slope that is of 1/2 ln det H_yy; best (n_unknowns,), follow (n_unknowns, n).
     """
 
@@ -167,6 +192,20 @@ class Parabola:
     room: NDArray[np.float64]
     best: NDArray[np.float64]
     follow: NDArray[np.float64]
+
+    def bent(self, last: Parabola) -> Parabola:
+        """The same with the curvature that the slope here and at the last place tell of the way between them.
+
+        By one update of Broyden, Fletcher, Goldfarb and Shanno (Nocedal & Wright 2006, section 6.1): in a valley that
+        winds the correlations of the Gauss-Newton matrix are not those of M.
+        """
+        step = np.linalg.solve(self.axes, self.best[self.moved] - last.best[self.moved])
+        change = self.slope - self.axes.T @ np.linalg.solve(last.axes.T, last.slope)
+        told, before = float(change @ step), self.bend @ step
+        if told <= LEAST * float(step @ before):
+            return self
+        bend = self.bend - np.outer(before, before) / float(step @ before) + np.outer(change, change) / told
+        return replace(self, bend=bend)
 
     def minimum(self, bounds: Bounds) -> tuple[NDArray[np.float64], float]:
         """All unknowns (n_unknowns,) at its minimum within bounds, and the longest step along an axis to it.

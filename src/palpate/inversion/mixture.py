@@ -18,7 +18,7 @@ from scipy import linalg, special
 from palpate.approximation.contract import determined
 from palpate.errors import EstimationError, SolverError
 from palpate.inversion.frozen_posterior import Posterior
-from palpate.inversion.laplace import MarginalMinimum, Nearby, marginal_minimum
+from palpate.inversion.laplace import PLACES, MarginalMinimum, MarginalPosterior, Nearby
 from palpate.inversion.objective import Evaluation
 from palpate.inversion.optimise import Bounds, Minimum, Outcome, same_minimum
 from palpate.inversion.scenarios import Alternatives, alternatives_of, frames_of, scenarios_of
@@ -32,7 +32,6 @@ TRUSTED_SD = 0.5  # of ln E: how far residuals are taken for linear where explan
 SEEN = 6.0  # of the log-evidence: explanations that are less likely than the best one by so much are left out
 MOST = 12  # explanations of a group whose minimum is sought on the model
 ROUNDS = 4  # over all images, to find the likeliest alternatives of each
-PLACES = 8  # at most, from one to the next of which the minimum of an explanation is sought
 BESIDE = 1.0  # standard deviations: so near the minimum of another explanation one is seen with what is known there
 
 
@@ -245,9 +244,9 @@ def _laplace(
     posterior: Posterior, bounds: Bounds, of: _Compared, begin: NDArray[np.float64], places: int
 ) -> _Laplace | None:
     """An explanation, its minimum sought from unknowns (n_unknowns,); None where the model cannot be solved there."""
-    own = posterior.believing(replace(posterior.parameters.choosing(dict(of.chosen)), volume=None))
+    own = posterior.believing(posterior.parameters.choosing(dict(of.chosen)))
     try:
-        found, nearby = marginal_minimum(own, begin, bounds, places)
+        found, nearby = MarginalPosterior.of(own).seen_at_minimum(begin, bounds, places)
     except SolverError:
         return None
     return _levelled(own.parameters, bounds, of, found, nearby)
@@ -255,16 +254,17 @@ def _laplace(
 
 def _laplace_beside(posterior: Posterior, bounds: Bounds, of: _Compared, leads: _Laplace) -> _Laplace | None:
     """An explanation with what is known around the minimum of another one; None where its own is too far from there."""
-    own = posterior.believing(replace(posterior.parameters.choosing(dict(of.chosen)), volume=None))
-    parabola = leads.nearby.parabola(own.parameters)
+    own = replace(posterior.parameters.choosing(dict(of.chosen)), volume=None)
+    nearby = leads.nearby.under(own)
+    parabola = nearby.parabola()
     target, away = parabola.minimum(bounds)
     if away > BESIDE:
         return None
     try:
-        found = leads.nearby.at_minimum(own, target, parabola, Outcome.CONVERGED)
+        found = nearby.at_minimum(MarginalPosterior.of(posterior.believing(own)), target, parabola, Outcome.CONVERGED)
     except SolverError:
         return None
-    return _levelled(own.parameters, bounds, of, found, leads.nearby)
+    return _levelled(own, bounds, of, found, nearby)
 
 
 def _free(parameters: ParameterMap, of: _Compared) -> tuple[int, ...]:

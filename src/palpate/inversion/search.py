@@ -16,8 +16,8 @@ from palpate.approximation.expansion import Expansion
 from palpate.errors import EstimationError, NotConverged, SolverError
 from palpate.inversion.frozen_posterior import Posterior, cheapest_posterior
 from palpate.inversion.hyper_parameters import with_amplitudes, with_correlations, with_scales
-from palpate.inversion.laplace import MarginalMinimum, marginal_minimum
-from palpate.inversion.mixture import PLACES, Candidates, Mixture, mixture_of
+from palpate.inversion.laplace import MarginalMinimum, MarginalPosterior
+from palpate.inversion.mixture import Candidates, Mixture, mixture_of
 from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, gauss_newton, same_minimum
 from palpate.inversion.scenarios import Alternatives, scenarios_of
@@ -227,12 +227,12 @@ def likely_minima(now: Searched, begins: Sequence[NDArray[np.float64]], bounds: 
     if now.frozen is None or not begins:
         return []
     n, likeliest = now.objective.n_parameters, now.posterior.explanations[0]
-    own = now.frozen.believing(replace(likeliest.prior(now.frozen.parameters), volume=None))
+    own = MarginalPosterior.of(now.frozen.believing(likeliest.prior(now.frozen.parameters)))
 
     def of(begin: NDArray[np.float64]) -> MarginalMinimum | None:
         """That which is found from there; None where the model cannot be solved."""
         try:
-            return marginal_minimum(own, begin, bounds, PLACES)[0]
+            return own.minimum(begin, bounds)
         except SolverError:
             return None
 

@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 from palpate.approximation.contract import Approximation, LinearisationPoint, updated
 from palpate.errors import SolverError
-from palpate.inversion import Bounds, Inversion, Minimum, Objective, Posterior, cheapest_posterior, gauss_newton
+from palpate.inversion import (
+    Bounds,
+    Inversion,
+    MarginalPosterior,
+    Minimum,
+    Objective,
+    Posterior,
+    cheapest_posterior,
+)
 from palpate.parallel import mapped
 from palpate.uncertainty import (
     NORMAL_95,
@@ -23,7 +31,6 @@ from palpate.uncertainty import (
 
 ROUNDS = 3  # largest number of times that models are made exact where profiles end
 MISSED = 1e-2  # of the displacement, in energy: error up to which a model is exact; it moves ends by a few hundredths
-TOLERANCE = 1e-6  # decrement of the minimum under the likeliest explanation, from which profiles and regions begin
 STAYS = 0.1  # of the half-width: largest change of an end with which the rounds stop
 
 
@@ -41,6 +48,11 @@ class StatedPosterior:
     objective: Objective | None = None
 
     @property
+    def marginal(self) -> MarginalPosterior:
+        """That of what acts on moduli."""
+        return MarginalPosterior.of(self.frozen)
+
+    @property
     def covariance(self) -> NDArray[np.float64]:
         """Covariance (n, n) of the parameters under the likeliest explanation, by all that is known."""
         return np.asarray(self.mixture.covariances[0])
@@ -51,14 +63,14 @@ def as_stated(inversion: Inversion, own: Covariance, bounds: Bounds) -> StatedPo
     objective, minimum = inversion.objective, inversion.minimum
     mixture = stated_mixture(inversion.mixture, own, objective.parameters.blocks)
     frozen = cheapest_posterior(objective, minimum.unknowns, minimum.evaluation)
-    least = gauss_newton(frozen, inversion.mixture.minimum.unknowns, bounds=bounds, tolerance=TOLERANCE)
+    least = MarginalPosterior.of(frozen).minimum(inversion.mixture.minimum.unknowns, bounds).minimum
     posterior = StatedPosterior(frozen, least, mixture, objective=objective)
     return exact_at_ends(profiled(posterior, bounds), objective, bounds) if minimum.converged else posterior
 
 
 def profiled(posterior: StatedPosterior, bounds: Bounds) -> StatedPosterior:
     """The same with the intervals that its profiles tell."""
-    variances, of = enumerate(np.diag(posterior.covariance).tolist()), (posterior.frozen, posterior.minimum)
+    variances, of = enumerate(np.diag(posterior.covariance).tolist()), (posterior.marginal, posterior.minimum)
     found = mapped(lambda one: modulus_interval(*of, one[0], variance=one[1], bounds=bounds), variances)
     return replace(posterior, intervals=tuple(found))
 

@@ -128,7 +128,7 @@ def combinations_of(
     if not inversion.minimum.converged:
         return ()
     scale = mapping.scale_kpa
-    covariance, own = posterior.mixture.covariance.total, (posterior.frozen, posterior.minimum)
+    covariance, own = posterior.mixture.covariance.total, (posterior.marginal, posterior.minimum)
     found = known_pairs(*own, mapping.tissues, covariance, bounds=bounds, within=within)
     return tuple(pair.times(scale) if pair.kind == "geometric mean" else pair for pair in found)
 
@@ -149,7 +149,7 @@ def regions_of(
     def region(pair: tuple[int, int]) -> ModulusRegion:
         """That of two moduli."""
         own = covariance[np.ix_(pair, pair)]
-        found = joint_region(posterior.frozen, posterior.minimum, pair, covariance=own, bounds=bounds)
+        found = joint_region(posterior.marginal, posterior.minimum, pair, covariance=own, bounds=bounds)
         edges = mapping.scale_kpa * np.exp(found.boundary), mapping.scale_kpa * np.exp(found.ellipse)
         boundary, ellipse = (tuple((float(a), float(b)) for a, b in edge) for edge in edges)
         return ModulusRegion((mapping.tissues[pair[0]], mapping.tissues[pair[1]]), boundary, ellipse, found.open)

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion import Bounds, Evaluation, LeastSquares, Minimum
+from palpate.inversion import Bounds, Evaluation, LeastSquares, MarginalPosterior, Minimum
 from palpate.uncertainty.intervals import NORMAL_95, modulus_interval
 
 
@@ -110,7 +110,7 @@ class _PairCoordinates:
 
 
 def known_pairs(
-    fixed: LeastSquares,
+    marginal: MarginalPosterior,
     minimum: Minimum,
     names: Sequence[str],
     covariance: NDArray[np.float64],
@@ -120,22 +120,23 @@ def known_pairs(
 ) -> tuple[Combination, ...]:
     """Ratios and geometric means known within a factor `within` from end to end, of pairs with a modulus that is not.
 
-    covariance (n, n): of the log-moduli of `names`, the first unknowns of a `minimum` of `fixed`. Where the ellipse is
+    covariance (n, n): of the log-moduli of `names`, the first unknowns of a `minimum` of M. Where the ellipse is
     so narrow, with a standard deviation of s^2 = w^T C w and weights w of (1, -1) for the ratio and (1/2, 1/2) for the
     mean, the interval is that of the combination's profile: where one of the moduli is wide, the ellipse is least true.
-    Raises `SolverError` and `EstimationError` as `gauss_newton` does.
+    Raises `SolverError` and `EstimationError` as M does.
     """
     found, widest = [], np.log(within) / (2.0 * NORMAL_95)
     for i, j in combinations(range(len(names)), 2):
         if max(covariance[i, i], covariance[j, j]) <= widest**2:
             continue
-        pair = _PairCoordinates(fixed, (i, j))
+        pair = _PairCoordinates(marginal.objective, (i, j))
+        turned = MarginalPosterior(pair, marginal.on_moduli)
         for number, kind, weights in ((i, "ratio", [1.0, -1.0]), (j, "geometric mean", [0.5, 0.5])):
             variance = float(weights @ covariance[np.ix_([i, j], [i, j])] @ weights)
             if variance > widest**2:
                 continue
             there, limits = pair.at(minimum), pair.between(bounds)
-            low, high = modulus_interval(pair, there, number, variance=variance, bounds=limits).ends
+            low, high = modulus_interval(turned, there, number, variance=variance, bounds=limits).ends
             if low is not None and high is not None and high / low <= within:
                 value = float(np.exp(there.unknowns[number]))
                 found.append(Combination((names[i], names[j]), kind, value, (low, high)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inversion import Bounds, LeastSquares, Minimum
+from palpate.inversion import Bounds, MarginalPosterior, Minimum
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface, triangle_normals
 from palpate.uncertainty.profile import Profile, profile
@@ -31,13 +31,13 @@ class ModulusInterval:
 
 
 def modulus_interval(
-    fixed: LeastSquares, minimum: Minimum, number: int, *, variance: float, bounds: Bounds
+    marginal: MarginalPosterior, minimum: Minimum, number: int, *, variance: float, bounds: Bounds
 ) -> ModulusInterval:
     """That of the log-modulus with a `number` and a `variance`: its ellipse, where the profile ends there, too."""
     centre, half = float(np.exp(minimum.unknowns[number])), NORMAL_95 * float(np.sqrt(variance))
     limits = {"lower": float(np.exp(bounds.lower[number])), "upper": float(np.exp(bounds.upper[number]))}
     ellipse = log_interval(centre, half / NORMAL_95, **limits)
-    found = profile(fixed, minimum, number, variance=variance, bounds=bounds, level=NORMAL_95)
+    found = profile(marginal, minimum, number, variance=variance, bounds=bounds, level=NORMAL_95)
     low, high = (None if end is None else float(np.exp(end)) for end in (found.low, found.high))
     same = all(
         (a is None and b is None) or (a is not None and b is not None and abs(np.log(a / b)) < AS_ELLIPSE * half)

@@ -1,8 +1,8 @@
-"""The profile likelihood of a modulus: what the images say of each of its values, all other unknowns at their best.
+"""The profile of a modulus: what the images say of each of its values, the other moduli at their best.
 
-An ellipse around the minimum takes the objective for a parabola of ln E. It is none where an organ is so stiff, or so
-soft, that its modulus hardly matters any more: there the profile is flat on one side, and its interval leans that way.
-Of two moduli it is a region, drawn beside the ellipse.
+An ellipse around the minimum takes the marginal posterior of the log-moduli, M (see `inversion.laplace`), for a
+parabola. It is none where an organ is so stiff, or so soft, that its modulus hardly matters any more: there the profile
+is flat on one side, and its interval leans that way. Of two moduli it is a region, drawn beside the ellipse.
 """
 
 from __future__ import annotations
@@ -18,15 +18,14 @@ from palpate.errors import SolverError
 from palpate.inversion import (
     Bounds,
     FixedCorrespondence,
-    FrozenPosterior,
-    LeastSquares,
     LinearisedObjective,
+    MarginalMinimum,
+    MarginalPosterior,
     Minimum,
     Objective,
     Outcome,
     fixed_correspondence,
     gauss_newton,
-    newton_step,
     posterior_sd,
     with_correlations,
     with_scales,
@@ -35,22 +34,20 @@ from palpate.inversion import (
 TRIALS = 12  # points on a ray from the estimate
 DIRECTIONS = 16  # of a joint region
 JOINT_LEVEL = float(np.sqrt(special.chdtri(2, 0.05)))  # root deviance on its boundary: two degrees of freedom
-TRIES = 3  # searches at a point, each with as many steps as a minimum
 NEAR = 0.05  # of the level: accuracy of an end before the line through the last two points corrects it
 NEARER = 0.02  # before the line through the minimum and the only point does
 FURTHEST = 2.0  # largest extrapolation, times the distance of the last point
 PASSES = 10
 SETTLED = 0.02  # posterior standard deviations
 TOLERANCE = 1e-6  # decrement of a minimum
-ON_RAY = 0.01  # decrement of a minimum on a ray; of the 1.92 at an end that is 0.25 % of the half-width
 
 
 @dataclass(frozen=True, slots=True)
 class Profile:
     """Signed root deviance r (n,) at values theta (n,) of one log-modulus, both ascending.
 
-    r^2 = 2 (min J(theta) - min J) / s with the ratio s of its variance to that of the Gauss-Newton matrix: what is
-    known of correlated residuals and of the voxels' place counts as in the ellipse, at whose ends r = 1.96 where J is a
+    r^2 = 2 (min M(theta) - min M) / s with the ratio s of its variance to that of M's minimum: what is known of
+    correlated residuals and of the voxels' place counts as in the ellipse, at whose ends r = 1.96 where M is a
     parabola. low, high: ln E where |r| is the level; None where the search's bound, or what cannot be solved, is
     reached before. outermost: all unknowns (n_unknowns,) at the last place on each side that has one.
     """
@@ -63,19 +60,19 @@ class Profile:
 
 
 def profile(
-    fixed: LeastSquares, minimum: Minimum, number: int, *, variance: float, bounds: Bounds, level: float
+    marginal: MarginalPosterior, minimum: Minimum, number: int, *, variance: float, bounds: Bounds, level: float
 ) -> Profile:
     """The profile of the log-modulus with a `number`, as far as |r| = `level` or its bound, on both sides.
 
     `variance` of the log-modulus by all that is known (see `sandwich_covariance`). The deviance is scaled so that its
     curvature is one over that (Chandler & Bate, Biometrika 94 (2007) 167-183, section 3, vertically).
     """
-    least = gauss_newton(fixed, minimum.unknowns, bounds=bounds, tolerance=1e-6)
-    scale = float(least.evaluation.covariance_columns(number + 1)[number, number]) / variance
-    held, centre = np.arange(fixed.n_parameters) == number, float(least.unknowns[number])
+    least = marginal.minimum(minimum.unknowns, bounds)
+    scale = float(least.covariance[number, number]) / variance
+    held, centre = np.arange(marginal.n_parameters) == number, float(least.minimum.unknowns[number])
     points, ends, outermost = [(centre, 0.0)], list[float | None](), list[NDArray[np.float64]]()
     for sign in (-1.0, 1.0):
-        ray = Ray(fixed, least, sign * held, held, bounds, scale)
+        ray = Ray(marginal, least, sign * held, held, bounds, scale)
         found, end = ray.to_level(level, first=level * float(np.sqrt(variance)))
         points += [(centre + sign * distance, sign * root) for distance, root, _ in found]
         outermost += [unknowns for _, _, unknowns in found[-1:]]
@@ -90,14 +87,14 @@ RayPoint = tuple[float, float, NDArray[np.float64]]
 
 @dataclass(frozen=True, slots=True)
 class Ray:
-    """A straight line of the log-moduli from a minimum, along which all unknowns that are not held are at their best.
+    """A straight line of the log-moduli from a minimum of M, along which those that are not held are at their best.
 
     direction (n_parameters,): change of the log-moduli for a distance of 1; held (n_parameters,): which of them the ray
-    holds; scale: that of the deviance 2 (min J - least J), whose root is r.
+    holds; scale: that of the deviance 2 (min M - least M), whose root is r.
     """
 
-    fixed: LeastSquares
-    least: Minimum
+    marginal: MarginalPosterior
+    least: MarginalMinimum
     direction: NDArray[np.float64]
     held: NDArray[np.bool_]
     bounds: Bounds
@@ -106,7 +103,7 @@ class Ray:
     @property
     def bound(self) -> float:
         """The distance at which the search's bounds end it."""
-        theta, along = self.least.unknowns[: len(self.direction)], self.direction != 0.0
+        theta, along = self.least.minimum.unknowns[: len(self.direction)], self.direction != 0.0
         limits = np.where(self.direction > 0.0, self.bounds.upper, self.bounds.lower)
         return float(np.min((limits - theta)[along] / self.direction[along]))
 
@@ -115,30 +112,13 @@ class Ray:
 
         H_ff s_f = -H_fh s_h with the Gauss-Newton matrix H; a log-modulus at a bound stays.
         """
-        n, evaluation = len(self.direction), self.least.evaluation
+        n, evaluation = len(self.direction), self.least.minimum.evaluation
         slope = np.pad(self.direction, (0, len(evaluation.score) - n))
-        still = self.held | self.bounds.reached(self.least.unknowns[:n])
+        still = self.held | self.bounds.reached(self.least.minimum.unknowns[:n])
         free = np.pad(~still, (0, len(slope) - n), constant_values=True)
         pulled = evaluation.matrix @ np.where(free, 0.0, slope)
         slope[free] = -evaluation.matrix.among(free).solve(pulled[free])
         return slope
-
-    def _at_its_best(self, start: NDArray[np.float64]) -> Minimum:
-        """The minimum over all that is not held, sought from unknowns (n,), and again from where a search stopped.
-
-        Where all log-moduli are held, and no other unknown acts on moduli, a frozen posterior is a parabola: one step
-        leads to its minimum.
-        """
-        fixed = self.fixed
-        if self.held.all() and isinstance(fixed, FrozenPosterior) and not len(fixed.parameters.free_on_moduli):
-            return at_held_moduli(fixed, start)
-        bounds = self.bounds.fixed(start[: len(self.held)], self.held)
-        for _ in range(TRIES):
-            found = gauss_newton(self.fixed, start, bounds=bounds, tolerance=ON_RAY)
-            if found.converged:
-                break
-            start = found.unknowns
-        return found
 
     def to_level(self, level: float, *, first: float) -> tuple[list[RayPoint], float | None]:
         """Points on the ray, from the `first` distance on, and the distance where r is the level; None at the bound.
@@ -150,9 +130,9 @@ class Ray:
         held, nothing is known of any end.
         """
         bound, n = self.bound, len(self.direction)
-        least, points, inside, outside = self.least.unknowns, list[RayPoint](), (0.0, 0.0), None
+        least, points, inside, outside = self.least.minimum.unknowns, list[RayPoint](), (0.0, 0.0), None
         distance = first
-        if bound <= 0.0 or not self.least.converged:
+        if bound <= 0.0 or not self.least.minimum.converged:
             return [], None
         slope = self._slope()
         for _ in range(TRIALS):
@@ -160,15 +140,14 @@ class Ray:
             start = least + distance * slope
             start[:n] = np.clip(start[:n], self.bounds.lower, self.bounds.upper)
             try:
-                found = self._at_its_best(start)
+                found = self.marginal.minimum(start, self.bounds.fixed(start[:n], self.held))
             except SolverError:
                 return points, None
-            deviance = 2.0 * self.scale * (found.evaluation.value - self.least.evaluation.value)
-            root = float(np.sqrt(max(deviance, 0.0)))
-            if not (found.converged or root < (1.0 - NEAR) * level):
+            root = float(np.sqrt(max(2.0 * self.scale * (found.least - self.least.least), 0.0)))
+            if not (found.minimum.converged or root < (1.0 - NEAR) * level):
                 return points, None
-            points.append((distance, root, found.unknowns))
-            slope = (found.unknowns - least) / distance
+            points.append((distance, root, found.minimum.unknowns))
+            slope = (found.minimum.unknowns - least) / distance
             if abs(root - level) < (NEAR if len(points) > 1 else NEARER) * level:
                 return points, _on_line(points, level)
             if root < level:
@@ -190,15 +169,6 @@ def _on_line(points: Sequence[RayPoint], level: float) -> float:
     (near, low, _), (far, high, _) = points[-2:] if len(points) > 1 else ((0.0, 0.0, None), points[0])
     rise = (high - low) / (far - near)
     return far + (level - high) / (rise if rise > 0.1 * high / far else high / far)
-
-
-def at_held_moduli(posterior: FrozenPosterior, start: NDArray[np.float64]) -> Minimum:
-    """The minimum over all but the log-moduli of unknowns (n,), with the evaluation at `start` but for the value."""
-    there, n = posterior(start), posterior.n_parameters
-    step = newton_step(there, np.arange(len(start)) >= n, n)
-    least = replace(there, value=there.value + 0.5 * float(there.score @ step))
-    outcome = Outcome.CONVERGED if np.isfinite(least.value) else Outcome.NOT_FINITE
-    return Minimum(start + step, least, outcome, (), 1)
 
 
 def refitted(
@@ -236,7 +206,7 @@ class JointRegion:
 
 
 def joint_region(
-    fixed: LeastSquares,
+    marginal: MarginalPosterior,
     minimum: Minimum,
     numbers: tuple[int, int],
     *,
@@ -246,20 +216,20 @@ def joint_region(
     """The region of two log-moduli around a minimum, in directions that are equally spaced on the ellipse.
 
     covariance (2, 2) of both by all that is known, V. Along a direction d the deviance is scaled by
-    d^T V^-1 d / d^T G^-1 d, G the covariance of the Gauss-Newton matrix, so that it ends where the ellipse does when
+    d^T V^-1 d / d^T G^-1 d, G the covariance of M's minimum, so that it ends where the ellipse does when
     the objective is a parabola (Chandler & Bate, Biometrika 94 (2007) 167-183, section 3, vertically). Where a bound is
     met before, the boundary lies there.
     """
-    least, pair = gauss_newton(fixed, minimum.unknowns, bounds=bounds, tolerance=1e-6), list(numbers)
-    own = least.evaluation.covariance_columns(fixed.n_parameters)[np.ix_(pair, pair)]
-    held = np.isin(np.arange(fixed.n_parameters), pair)
-    centre, edge, cut, first = least.unknowns[pair], list[NDArray[np.float64]](), False, JOINT_LEVEL
+    least, pair = marginal.minimum(minimum.unknowns, bounds), list(numbers)
+    own, n = least.covariance[np.ix_(pair, pair)], marginal.n_parameters
+    held = np.isin(np.arange(n), pair)
+    centre, edge, cut, first = least.minimum.unknowns[pair], list[NDArray[np.float64]](), False, JOINT_LEVEL
     angles = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ np.linalg.cholesky(covariance).T  # V^-1 norm 1
     for along in directions:
-        direction = np.zeros(fixed.n_parameters)
+        direction = np.zeros(n)
         direction[pair] = along
-        ray = Ray(fixed, least, direction, held, bounds, 1.0 / float(along @ np.linalg.solve(own, along)))
+        ray = Ray(marginal, least, direction, held, bounds, 1.0 / float(along @ np.linalg.solve(own, along)))
         points, end = ray.to_level(JOINT_LEVEL, first=first)  # the boundary is smooth: from where the last one lay
         first = end or JOINT_LEVEL
         reached = end if end is not None else max((distance for distance, *_ in points), default=0.0)
