@@ -66,9 +66,10 @@ def methods_text(data: ReportData) -> Methods:
             f" drivers' walls by Huber's loss {cite('huber')}. The posterior of the moduli's logarithms was a"
             " mixture over what may explain the images: how patchy the tissues are, whether layers lie round organs,"
             " whether the frame moves, and whether each image draws the surfaces alike. Each explanation counted"
-            f" by its evidence in Laplace's approximation {cite('laplace')}, at its own minimum over all others."
-            f" Minima were found by Gauss-Newton steps in a trust region {cite('nocedal')} on reduced models"
-            f" {cite('reduced')}, which were made exact at the mean of each group of explanations."
+            " by its evidence: all unknowns that act on no modulus were integrated out, and Laplace's approximation"
+            f" {cite('laplace')} was taken of what is left. Its minimum was found by Newton's method, corrected by"
+            f" the last step {cite('nocedal')}, on reduced models {cite('reduced')}, which were made exact at the mean"
+            " of each group of explanations."
             f" {len(data.document['starts'])} starts looked for other minima."
             f"{onwards if law is not None and law.finite else ''}"
         ),
