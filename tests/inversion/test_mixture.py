@@ -80,9 +80,16 @@ def test_all_explanations_of_one_image_are_compared_and_the_likely_ones_of_sever
     best = max(every.values())
     found = {tuple(sorted(each.chosen)) for each in compared(of, objective)}
     near = {chosen for chosen, level in every.items() if level > best - SEEN}
-    assert found <= near
+
+    def with_layers(chosen):
+        return [k for i, k in chosen if of.parameters.blocks[i].choice is Choice.LAYERS]
+
+    for chosen in found - near:  # the likeliest with layers, or without: its minimum may be far away
+        assert every[chosen] == max(
+            level for other, level in every.items() if with_layers(other) == with_layers(chosen)
+        )
     if of.parameters.n_states == 1:
-        assert found == near
+        assert found >= near
     shares = {chosen: np.exp(level - best) for chosen, level in every.items()}
     assert sum(shares[chosen] for chosen in found) > 0.97 * sum(shares.values())
 

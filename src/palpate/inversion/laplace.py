@@ -82,12 +82,15 @@ class MarginalPosterior:
             if last is not None and parabola.value > last.value + RISE and left:
                 at = 0.5 * (at + last.best)
                 continue
-            parabola = parabola if last is None else parabola.bent(last)
-            target, away = parabola.minimum(bounds)
+            target, away = (parabola if last is None else parabola.bent(last)).minimum(bounds)
             if away < NEAR:
                 break
             at, last = target, parabola
         outcome = Outcome.CONVERGED if away < NEAR else Outcome.STEPS
+        if outcome.converged and len(nearby.moved) > 1:
+            nearby = nearby.with_pairs(self)
+            parabola = nearby.parabola()
+            target, _ = parabola.minimum(bounds)
         return nearby.at_minimum(self, target, parabola, outcome), nearby
 
 
@@ -98,7 +101,8 @@ class Nearby:
     moved (n,): numbers of t among the unknowns; others (n_unknowns,): which are integrated out, none of the log-moduli;
     axes U (n, n): columns with U^T S U = 1, S the Schur complement of the Gauss-Newton matrix, of what is known best
     first, which moves what is known less; steps (n,): how far along each; open (n,): those so long that bounds cut
-    them; places (1 + 2 n, n_unknowns) with their evaluations: the centre, those before, and those behind.
+    them; places (1 + 2 n, n_unknowns) with their evaluations: the centre, those before, and those behind, and, where it
+    is seen with pairs, those before, and behind, along both of two axes.
     """
 
     moved: NDArray[np.int64]
@@ -127,6 +131,14 @@ class Nearby:
         others[moved] = False
         return cls(moved, others, axes, steps, np.any(longest > room, axis=0), places, evaluations)
 
+    def with_pairs(self, marginal: MarginalPosterior) -> Nearby:
+        """The same with what it is along every two axes together."""
+        n, (one, other) = len(self.moved), np.triu_indices(len(self.moved), 1)
+        numbers = np.append(one, n + one), np.append(other, n + other)
+        along = self.places[1 + numbers[0]] + self.places[1 + numbers[1]] - self.places[0]
+        evaluations = (*self.evaluations, *mapped(marginal.objective, along))
+        return replace(self, places=np.concatenate([self.places, along]), evaluations=evaluations)
+
     def under(self, parameters: ParameterMap) -> Nearby:
         """The same under another prior of the unknowns."""
         pairs = zip(self.places, self.evaluations, strict=True)
@@ -141,11 +153,11 @@ class Nearby:
 
         def slopes(of: NDArray[np.float64]) -> NDArray[np.float64]:
             """By differences of both sides."""
-            return np.asarray((of[1 : n + 1] - of[n + 1 :]) / twice)
+            return np.asarray((of[1 : n + 1] - of[n + 1 : 2 * n + 1]) / twice)
 
         def curvatures(of: NDArray[np.float64]) -> NDArray[np.float64]:
             """By those of both sides and the centre."""
-            return np.asarray((of[1 : n + 1] + of[n + 1 :] - 2.0 * of[0]) / self.steps**2)
+            return np.asarray((of[1 : n + 1] + of[n + 1 : 2 * n + 1] - 2.0 * of[0]) / self.steps**2)
 
         told = ~self.open  # on a plain any slope of the room would lead to a bound
         slope, bend = slopes(least) + told * slopes(room), curvatures(least) + told * curvatures(room)
@@ -154,8 +166,15 @@ class Nearby:
         own = np.diag(gauss_newton)
         longer = np.sqrt(np.where(told & (bend > LEAST * own), bend, own) / own)
         best = np.stack([of.best for of in every])
-        follow = (best[1 : n + 1] - best[n + 1 :]).T / twice
+        follow = (best[1 : n + 1] - best[n + 1 : 2 * n + 1]).T / twice
         bend = longer[:, None] * gauss_newton * longer
+        if len(least) > 2 * n + 1:
+            whole, (one, other) = least + np.where(told.all(), room, 0.0), np.triu_indices(n, 1)
+            sides = whole[1 : n + 1] + whole[n + 1 : 2 * n + 1] - 2.0 * whole[0]
+            both = whole[2 * n + 1 :].reshape(2, -1).sum(axis=0) - 2.0 * whole[0] - sides[one] - sides[other]
+            seen = np.diag(np.diag(bend))
+            seen[one, other] = seen[other, one] = 0.5 * both / (self.steps[one] * self.steps[other])
+            bend = seen if np.linalg.eigvalsh(seen / np.sqrt(np.outer(*(np.diag(bend),) * 2)))[0] > LEAST else bend
         return Parabola(self.moved, self.axes, least[0] + room[0], slope, bend, told * slopes(room), best[0], follow)
 
     def at_minimum(
@@ -180,7 +199,7 @@ class Nearby:
 class Parabola:
     """M(U xi) = value + slope . xi + 1/2 xi . B xi along the axes U of t, B `bend`; the others `best` + `follow` xi.
 
-    B (n, n) has the second differences of M on its diagonal, beside it the correlations of the Gauss-Newton matrix.
+    B (n, n) has second differences of M, or of these its diagonal and the correlations of the Gauss-Newton matrix.
     room (n,): the part of the slope that is of 1/2 ln det H_yy; best (n_unknowns,), follow (n_unknowns, n).
     """
 

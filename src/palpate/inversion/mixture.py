@@ -25,9 +25,10 @@ from palpate.inversion.scenarios import Alternatives, alternatives_of, frames_of
 from palpate.mechanics.solvers.cholesky import backward, forward, lower_factor
 from palpate.parallel import mapped
 from palpate.unknowns.arrowhead import Arrowhead
-from palpate.unknowns.blocks import Alternative
+from palpate.unknowns.blocks import Alternative, Choice
 from palpate.unknowns.parameters import ParameterMap, Volume
 
+FAR_SEEN = 20.0  # the same of the likeliest one with layers, or without: its minimum may be far away
 TRUSTED_SD = 0.5  # of ln E: how far residuals are taken for linear where explanations are compared first
 SEEN = 6.0  # of the log-evidence: explanations that are less likely than the best one by so much are left out
 MOST = 12  # explanations of a group whose minimum is sought on the model
@@ -437,10 +438,14 @@ class LinearEvidence:
             if candidates.kept(scenario):
                 found += [(evidence, scenario, minimum) for evidence, minimum in self._of_scenario(scenario, most)]
         best, chosen = max(evidence for evidence, *_ in found), list[_Compared]()
+        blocks, known = self.parameters.blocks, set[tuple[tuple[int, int], ...]]()
         for evidence, scenario, minimum in sorted(found, key=lambda each: -each[0]):
             number = counts[scenario.group] = counts.get(scenario.group, 0) + 1
-            if evidence > best - SEEN and len(chosen) < most and (of_group is None or number <= of_group):
+            layers = tuple(pair for pair in scenario.chosen if blocks[pair[0]].choice is Choice.LAYERS)
+            least = best - (SEEN if layers in known else FAR_SEEN)
+            if evidence > least and len(chosen) < most and (of_group is None or number <= of_group):
                 chosen.append(minimum())
+                known.add(layers)
         return chosen
 
     def _of_scenario(self, scenario: Alternatives, most: int) -> list[tuple[float, Callable[[], _Compared]]]:
