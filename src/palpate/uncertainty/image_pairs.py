@@ -16,11 +16,11 @@ from scipy import special
 from palpate.inversion import (
     Bounds,
     FrozenPosterior,
+    MarginalPosterior,
     Minimum,
     Objective,
     Posterior,
     fixed_correspondence,
-    gauss_newton,
 )
 from palpate.observation.noise_model import NoiseModel
 from palpate.uncertainty.covariance import (
@@ -39,7 +39,6 @@ from palpate.unknowns import Choice
 OUTLIER = 0.01  # probability of a false outlier among all pairs
 MOST_OUTLIERS = 4  # at most one pair of four is an outlier; where more differ, the pairs vary and none is wrong
 LEAST_PAIRS = 3  # of two pairs that differ, either may be wrong
-NEAR = 1e-4  # decrement of the minimum of a pair alone
 BETWEEN_GRIDS = 0.5  # factor on the covariance of two pairs from few draws, which keeps the whole positive
 
 
@@ -116,7 +115,7 @@ def pair_estimates(
 
 
 def _each_alone(objective: Objective, minimum: Minimum, bounds: Bounds, frozen: Posterior | None) -> list[Minimum]:
-    """The minimum of each later state alone, its unknowns those of `ParameterMap.alone`.
+    """The minimum of M of each later state alone, its unknowns those of `ParameterMap.alone`.
 
     Where its posterior is frozen, that is where it is sought; its residuals are then evaluated once.
     """
@@ -129,7 +128,7 @@ def _each_alone(objective: Objective, minimum: Minimum, bounds: Bounds, frozen: 
         evaluation = replace(minimum.evaluation, linearisations=linearisations)
         fixed = fixed_correspondence(Objective((state,), parameters), start, evaluation)
         alone = frozen.alone(s) if isinstance(frozen, FrozenPosterior) else fixed
-        least = gauss_newton(alone, start, bounds=bounds, tolerance=NEAR)
+        least = MarginalPosterior.of(alone).minimum(start, bounds).minimum
         found.append(least if alone is fixed else replace(least, evaluation=fixed(least.unknowns)))
     return found
 

@@ -333,16 +333,13 @@ class ParameterMap:
         return np.pad(moved, ((0, 0), (0, n_offsets)))
 
     def alone(self, state: int) -> tuple[ParameterMap, NDArray[np.int64]]:
-        """The map of one later state alone, without earlier images, and the numbers (n_own,) of its unknowns."""
+        """The map of one later state, without earlier images and room, and the numbers (n_own,) of its unknowns."""
         kept = [i for i, block in enumerate(self.blocks) if state in block.states]
         blocks = tuple(replace(self.blocks[i], states=(0,)) for i in kept)
         own = np.concatenate([np.arange(self.n_parameters), *(self.columns(i) for i in kept)])
-        share = self.volume
-        if share is not None:
-            share = replace(share, slope=share.slope / self.n_states, numbers=np.searchsorted(own, share.numbers))
         priors = tuple(self.priors[i] for i in kept)
         levels = tuple(level for i, level in zip(self._of_tissues, self.levels, strict=True) if i in kept)
-        return replace(self, blocks=blocks, priors=priors, volume=share, earlier={}, levels=levels), own
+        return replace(self, blocks=blocks, priors=priors, volume=None, earlier={}, levels=levels), own
 
     def _model_columns(self, state: int) -> NDArray[np.int64]:
         return np.concatenate([self.acting(Acts.BOUNDARY, state), self.acting(Acts.MATERIAL, state)])
