@@ -102,7 +102,7 @@ class Nearby:
     axes U (n, n): columns with U^T S U = 1, S the Schur complement of the Gauss-Newton matrix, of what is known best
     first, which moves what is known less; steps (n,): how far along each; open (n,): those so long that bounds cut
     them; places (1 + 2 n, n_unknowns) with their evaluations: the centre, those before, and those behind, and, where it
-    is seen with pairs, those before, and behind, along both of two axes.
+    is seen with pairs, those to both sides along every two axes.
     """
 
     moved: NDArray[np.int64]
@@ -134,8 +134,11 @@ class Nearby:
     def with_pairs(self, marginal: MarginalPosterior) -> Nearby:
         """The same with what it is along every two axes together."""
         n, (one, other) = len(self.moved), np.triu_indices(len(self.moved), 1)
-        numbers = np.append(one, n + one), np.append(other, n + other)
-        along = self.places[1 + numbers[0]] + self.places[1 + numbers[1]] - self.places[0]
+        first, second = (
+            np.concatenate([one, n + one, one, n + one]),
+            np.concatenate([other, n + other, n + other, other]),
+        )
+        along = self.places[1 + first] + self.places[1 + second] - self.places[0]
         evaluations = (*self.evaluations, *mapped(marginal.objective, along))
         return replace(self, places=np.concatenate([self.places, along]), evaluations=evaluations)
 
@@ -170,10 +173,9 @@ class Nearby:
         bend = longer[:, None] * gauss_newton * longer
         if len(least) > 2 * n + 1:
             whole, (one, other) = least + np.where(told.all(), room, 0.0), np.triu_indices(n, 1)
-            sides = whole[1 : n + 1] + whole[n + 1 : 2 * n + 1] - 2.0 * whole[0]
-            both = whole[2 * n + 1 :].reshape(2, -1).sum(axis=0) - 2.0 * whole[0] - sides[one] - sides[other]
+            alike, unlike = whole[2 * n + 1 :].reshape(2, 2, -1).sum(axis=1)
             seen = np.diag(np.diag(bend))
-            seen[one, other] = seen[other, one] = 0.5 * both / (self.steps[one] * self.steps[other])
+            seen[one, other] = seen[other, one] = 0.25 * (alike - unlike) / (self.steps[one] * self.steps[other])
             bend = seen if np.linalg.eigvalsh(seen / np.sqrt(np.outer(*(np.diag(bend),) * 2)))[0] > LEAST else bend
         return Parabola(self.moved, self.axes, least[0] + room[0], slope, bend, told * slopes(room), best[0], follow)
 
