@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
 
+from palpate.errors import SolverError
 from palpate.inversion import Bounds, MarginalPosterior, fixed_correspondence
 from palpate.uncertainty.profile import DIRECTIONS, JOINT_LEVEL, joint_region, profile
 
@@ -67,3 +70,28 @@ def test_bounds_cut_the_region_and_it_says_so(fixed, minimum, covariance, region
 def test_the_order_of_the_two_is_that_of_the_columns(fixed, minimum, covariance, region):
     other = joint_region(fixed, minimum, (1, 0), covariance=covariance[::-1, ::-1], bounds=WIDE)
     assert other.boundary.max(axis=0) == pytest.approx(region.boundary.max(axis=0)[::-1], abs=0.08)
+
+
+@dataclass(frozen=True)
+class Brittle:
+    """An objective that is solved no further than so many standard deviations from a place."""
+
+    of: object
+    place: np.ndarray
+    reach: np.ndarray
+
+    @property
+    def n_parameters(self):
+        return self.of.n_parameters
+
+    def __call__(self, unknowns):
+        if np.any(np.abs(unknowns[:2] - self.place) > self.reach):
+            raise SolverError("too far")
+        return self.of(unknowns)
+
+
+def test_a_region_that_cannot_be_followed_is_open(fixed, minimum, covariance):
+    of = Brittle(fixed.objective, minimum.unknowns[:2], 1.5 * np.sqrt(np.diag(covariance)))
+    found = joint_region(replace(fixed, objective=of), minimum, (0, 1), covariance=covariance, bounds=WIDE)
+    assert found.open
+    assert np.all(np.abs(found.boundary - minimum.unknowns[:2]) <= of.reach + 1e-9)

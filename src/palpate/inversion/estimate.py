@@ -73,7 +73,7 @@ def invert(
     estimate that did not converge says so in its minimum's outcome.
     """
     bounds, n = settings.bounds, problem.parameters.n_parameters
-    theta = of_one_image(problem.linear(), settings, progress=progress)
+    theta, counts = of_one_image(problem.linear(), settings, progress=progress)
     start = informed_start(problem, theta, progress=progress)
     nothing = np.zeros(len(start.minimum.unknowns))
     rest = start.objective.rematched(nothing)(nothing)
@@ -100,22 +100,26 @@ def invert(
     if finite and end.minimum.converged:
         progress("finite strain: the exact equilibrium at the estimate")
         end = end.at_equilibrium()
-    return Inversion(end.objective, end.minimum, end.posterior, runs, rest, 1 + end.minimum.evaluations, end.counts)
+    return Inversion(
+        end.objective, end.minimum, end.posterior, runs, rest, 1 + end.minimum.evaluations, counts + end.counts
+    )
 
 
-def of_one_image(problem: InverseProblem, settings: InversionSettings, *, progress: Progress) -> NDArray[np.float64]:
-    """Theta (n_parameters,) where a linear problem's first minimum is sought: the settings' centre of one later image.
+def of_one_image(
+    problem: InverseProblem, settings: InversionSettings, *, progress: Progress
+) -> tuple[NDArray[np.float64], SolveCounts]:
+    """Theta (n_parameters,) where a linear problem's first minimum is sought, and what it cost to find.
 
-    Of several, where the one that moved most leads from there. It costs a fraction of what they cost together, whose
-    responses are then made near where they are needed.
+    Of one later image that is the centre of the settings; of several, where the one that moved most leads from there.
+    The responses of all are then made near where they are needed. Raises as `invert` does.
     """
     if len(problem.states) == 1 or any(state.approximation for state in problem.states):
-        return settings.centre
-    most = max(range(len(problem.states)), key=lambda s: problem.states[s].moved)
+        return settings.centre, SolveCounts()
+    most = max(range(len(problem.states)), key=lambda s: problem.states[s].motion_mm2)
     alone = InverseProblem((replace(problem.states[most], reference=0),), problem.parameters.alone(most)[0])
     start = informed_start(alone, settings.centre, progress=progress)
     found = approached(start, settings.bounds, progress=progress, title="one later image")
-    return found.minimum.unknowns[: alone.parameters.n_parameters]
+    return found.minimum.unknowns[: alone.parameters.n_parameters], found.counts
 
 
 def at_finite_strain(near: Searched, *, progress: Progress) -> Searched:

@@ -113,8 +113,8 @@ class FrozenState:
 
     Offsets of the residuals, and modes of surfaces at rest, stand before the 1. expanded (n_regions,) kPa: E_0 where an
     expansion adds to the model, z = [a, q, ln E - ln E_0, 1]; form: Q (k, k), the residuals' part of the objective is
-    1/2 z^T Q z; square: S (k, k), their mean square is z^T S z, mm^2; root, beside, left: upper R_a (m, m), R_l^T and
-    Q_l of the others z_l, with which it is 1/2 |R_a a + R_l z_l|^2 + 1/2 z_l^T Q_l z_l but for what is linear in z;
+    1/2 z^T Q z; square: S (k, k), their mean square is z^T S z, mm^2; root, beside, left: lower R_a^T (m, m), R_l^T
+    and Q_l of the others z_l, with which it is 1/2 |R_a a + R_l z_l|^2 + 1/2 z_l^T Q_l z_l but for what is linear in z;
     common: how many first basis vectors are those of the first state.
     """
 

@@ -55,7 +55,7 @@ class LaterState:
         return np.concatenate([seen_by(observation, displacement) for observation in self.observations])
 
     @property
-    def moved(self) -> float:
+    def motion_mm2(self) -> float:
         """Mean square (mm^2) of how far what is observed lies from where the reference image shows it."""
         found = list[float]()
         for observation in self.observations:

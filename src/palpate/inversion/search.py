@@ -30,7 +30,7 @@ from palpate.unknowns.blocks import Choice
 RADIUS = 1.5  # of ln E: longest step
 FITS, FAR_FITS, STAYS = 10, 2, 0.01  # of the noise near the end, and far from it; change of its ln that ends them
 NEAR = 1e-3  # decrement of a minimum on linear residuals
-SEEN = 0.1  # the same of one whose residuals tell the noise alone
+NEAR_FOR_NOISE = 0.1  # the same of one whose residuals tell the noise alone
 HALVINGS = 5  # of a step that leads to a state which cannot be solved
 FLOOR = 1e-4  # of ln E: a move that is always short enough
 LAST_FIT = 0.3  # standard deviations that the mean moved: so near, the noise is fitted for the last time
@@ -327,7 +327,7 @@ def _fitted(now: Searched, near: Bounds, *, fits: bool) -> tuple[Objective, Eval
     number, start = FITS if now.moved < 1.0 else FAR_FITS, at.unknowns
     for fit in range(number if fits else 1):
         linear = LinearisedObjective(objective, at.unknowns, at.evaluation)
-        found = gauss_newton(linear, start, bounds=near, tolerance=SEEN)
+        found = gauss_newton(linear, start, bounds=near, tolerance=NEAR_FOR_NOISE)
         if not fits:
             break
         before, start = objective, found.unknowns

@@ -123,7 +123,7 @@ def known_pairs(
     covariance (n, n): of the log-moduli of `names`, the first unknowns of a `minimum` of M. Where the ellipse is
     so narrow, with a standard deviation of s^2 = w^T C w and weights w of (1, -1) for the ratio and (1/2, 1/2) for the
     mean, the interval is that of the combination's profile: where one of the moduli is wide, the ellipse is least true.
-    Raises `SolverError` and `EstimationError` as M does.
+    Raises `SolverError` where the model cannot be solved at the minimum.
     """
     found, widest = [], np.log(within) / (2.0 * NORMAL_95)
     for i, j in combinations(range(len(names)), 2):
