@@ -73,8 +73,8 @@ def warp(results: Results, folder: Path) -> Iterator[Row]:
     points = np.unique(space.facets(faces))
     before = space.points[points]
     after = before + displacement[points]
-    if result.alignments:
-        after = result.alignments[-1].motion.apply(after)
+    if alignment := result.pairs[0].later[-1].alignment:
+        after = alignment.motion.apply(after)
     for name, start, goal in (("warp", before, after), ("inverse_warp", after, before)):
         image = sitk.ReadImage(str(folder / "warp" / f"{name}.nii.gz"), sitk.sitkVectorFloat64)
         transform = sitk.DisplacementFieldTransform(image)

@@ -90,7 +90,7 @@ def _shifted(scene: Scene, rng: np.random.Generator) -> LabelImage:
 def _estimated(case: Case, pairs: Sequence[ImagedStates], truth: Mapping[str, float]) -> dict[str, Any]:
     """Errors of ln E by organ, of the joint estimate, of every pair alone in it, and of the robust mean."""
     began = time.perf_counter()
-    estimation = estimate_states(pairs[0], case, further=tuple(pairs[1:]), truth=truth).estimation
+    estimation = estimate_states(pairs, case, truth=truth).estimation
     found: dict[str, Any] = {"status": estimation.status, "seconds": round(time.perf_counter() - began, 1)}
     found["joint"] = [
         None if e.value is None else float(np.log(e.value / truth[e.tissue])) for e in estimation.estimates

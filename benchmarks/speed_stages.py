@@ -43,7 +43,7 @@ def shares_of_stages(scene: Scene, case: Case) -> dict[str, Any]:
     profile = cProfile.Profile()
     profile.enable()
     before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
-    result = estimate_states(aligned(before, (after,), method="none"), case)
+    result = estimate_states([aligned(before, (after,), method="none")], case)
     profile.disable()
     known = pstats.Stats(profile)
     total = known.total_tt  # type: ignore[attr-defined]

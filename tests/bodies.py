@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
+from palpate.study.result import CaseResult
 
 TISSUES = (
     Tissue("prostate", Role.ESTIMATE, (1,)),
@@ -60,3 +63,8 @@ def box_cells(counts: tuple[int, int, int], size: tuple[float, ...]) -> tuple[ND
         steps = np.cumsum(np.concatenate([np.zeros((1, 3), int), np.eye(3, dtype=int)[list(order)]]), axis=0)
         tets.append(np.stack([np.ravel_multi_index((corner + step).T, ends) for step in steps], axis=1))
     return index / (ends - 1) * size, np.concatenate(tets)
+
+
+def with_first_pair(result: CaseResult, **changes: Any) -> CaseResult:
+    """A result with changes of its first reference state."""
+    return replace(result, pairs=(replace(result.pairs[0], **changes), *result.pairs[1:]))

@@ -32,7 +32,8 @@ from palpate.study.case import Case, CaseTissue, Estimate, Images
 from palpate.study.case_file import read_case
 from palpate.study.check import check_case
 from palpate.study.estimated import Estimation, Iteration, ModulusEstimate, Start, StatedExplanation, TissueFit
-from palpate.study.result import CaseResult, MeshSummary, Provenance
+from palpate.study.imaged import LaterImage
+from palpate.study.result import CaseResult, MeshSummary, PairResult, Provenance
 from palpate.study.samples import ModulusSamples
 from palpate.uncertainty import Covariance
 
@@ -190,12 +191,16 @@ def case_result() -> CaseResult:
     return CaseResult(
         case=case,
         estimation=make_estimation(motion(space.points)),
-        space=space,
-        mesh_summary=MeshSummary(
-            len(mesh.nodes), len(mesh.tets), 3 * len(space.points), 45.0, 45.0, {"prostate": 0.01}
+        pairs=(
+            PairResult(
+                space=space,
+                mesh_summary=MeshSummary(
+                    len(mesh.nodes), len(mesh.tets), 3 * len(space.points), 45.0, 45.0, {"prostate": 0.01}
+                ),
+                before=make_segmentation(mesh, moved=False),
+                later=(LaterImage(1, make_segmentation(mesh, moved=True)),),
+            ),
         ),
-        before=make_segmentation(mesh, moved=False),
-        after=(make_segmentation(mesh, moved=True),),
         provenance=Provenance({"total": 1.5}, {"before": "ab" * 32}, {"palpate": "0.1.0"}),
     )
 

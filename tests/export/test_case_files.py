@@ -9,6 +9,7 @@ import nibabel
 import numpy as np
 import pytest
 
+from bodies import with_first_pair
 from palpate.export.case_files import file_name, write_estimate_files, write_mesh_files, write_simulation_files
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.label_table import read_label_table
@@ -89,7 +90,8 @@ def test_ratios_are_not_passed_off_as_kilopascals(tmp_path, case_result):
     mesh = case_result.space.mesh
     rest = dataclasses.replace(mesh.tissues[3], role=Role.ESTIMATE, youngs_modulus_kpa=None)
     space = dataclasses.replace(case_result.space, mesh=dataclasses.replace(mesh, tissues=(*mesh.tissues[:3], rest)))
-    result = dataclasses.replace(case_result, space=space, estimation=dataclasses.replace(estimation, estimates=ratios))
+    estimation = dataclasses.replace(estimation, estimates=ratios)
+    result = dataclasses.replace(with_first_pair(case_result, space=space), estimation=estimation)
     assert result.unit == "ratio"
     write_estimate_files(result, tmp_path)
     written = meshio.read(tmp_path / "mesh.vtu")

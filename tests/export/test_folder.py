@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import palpate
+from bodies import with_first_pair
 from palpate.cli import main
 from palpate.errors import ConfigurationError, EstimationError, InputDataError
 from palpate.export.fitted_model import fitted_model
@@ -22,7 +23,6 @@ from palpate.report import case_report
 from palpate.study.case import Images
 from palpate.study.earlier import seal_of
 from palpate.study.outputs import sha256_of
-from palpate.study.result import PairResult
 
 
 def save(result, folder):
@@ -175,8 +175,8 @@ def test_without_chains_there_is_no_file_of_them_and_an_earlier_one_goes(sampled
 
 def test_each_further_pair_has_a_folder_of_its_own(case_result, tmp_path):
     r = case_result
-    pair = PairResult(r.space, r.mesh_summary, r.before, r.after, (0.5 * r.estimation.displacements[0],))
-    both = dataclasses.replace(r, further=(pair,))
+    estimation = dataclasses.replace(r.estimation, displacements=(r.displacements[0], 0.5 * r.displacements[0]))
+    both = dataclasses.replace(r, pairs=2 * r.pairs, estimation=estimation)
     names = {path.relative_to(tmp_path).as_posix() for path in palpate.export(both, tmp_path, format="gmsh")}
     assert names == {"palpate.msh", "pair_2/palpate.msh"}
 
@@ -184,7 +184,8 @@ def test_each_further_pair_has_a_folder_of_its_own(case_result, tmp_path):
 def test_several_later_images_are_steps_one_after_the_other(case_result, tmp_path):
     first = case_result.estimation.displacements[0]
     estimation = dataclasses.replace(case_result.estimation, displacements=(first, 1.5 * first))
-    two = dataclasses.replace(case_result, estimation=estimation, after=case_result.after * 2)
+    later = 2 * case_result.pairs[0].later
+    two = dataclasses.replace(with_first_pair(case_result, later=later), estimation=estimation)
     for name in ("abaqus", "febio", "stl", "vtu", "warp"):
         assert palpate.export(two, tmp_path / name, format=name, linear=True)
     assert (tmp_path / "abaqus" / "palpate.inp").read_text().count("*END STEP") == 2
@@ -214,7 +215,9 @@ def test_no_name_or_path_of_an_input_is_in_an_export(case_result, tmp_path, caps
     called = tuple(dataclasses.replace(tissue, called=("lobe of M.",)) for tissue in mesh.tissues)
     space = dataclasses.replace(case_result.space, mesh=dataclasses.replace(mesh, tissues=called))
     before = dataclasses.replace(case_result.before, tissues=called)
-    planted = dataclasses.replace(case_result, case=case, space=space, before=before, note="told by Erika")
+    planted = dataclasses.replace(
+        with_first_pair(case_result, space=space, before=before), case=case, note="told by Erika"
+    )
     folder = save(planted, tmp_path / "hospital" / "result")
     assert planted_in(folder / "result.json")
     assert planted_in(folder / "case.toml")

@@ -21,6 +21,7 @@ import SimpleITK
 from scipy.spatial.transform import Rotation
 
 import palpate
+from bodies import with_first_pair
 from dicom_files import PLANTED, TILTED, ct_slices, save_series
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.export import abaqus, febio
@@ -143,7 +144,7 @@ def sliding(result, turn):
     turned = np.eye(4)
     turned[:3, :3] = turn
     before = dataclasses.replace(result.before, grid=dataclasses.replace(grid, affine=turned @ grid.affine))
-    return dataclasses.replace(result, case=case, space=lagrange_space(mesh, "P2"), before=before)
+    return dataclasses.replace(with_first_pair(result, space=lagrange_space(mesh, "P2"), before=before), case=case)
 
 
 OBLIQUE = Rotation.from_rotvec(np.radians(37.0) * np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0)).as_matrix()
@@ -163,7 +164,7 @@ def test_loads_on_what_slides_askew_are_stated_along_its_axes(case_result, tmp_p
     grid = result.before.grid
     swapped = VoxelGrid(tuple(np.array(grid.shape)[mirror].tolist()), grid.affine[:, [*mirror, 3]])
     before = dataclasses.replace(result.before, grid=swapped, index=result.before.index.transpose(mirror))
-    palpate.export(dataclasses.replace(result, before=before), tmp_path, format="abaqus")
+    palpate.export(with_first_pair(result, before=before), tmp_path, format="abaqus")
     text = (tmp_path / "palpate.inp").read_text()
     first, second = np.array([float(x) for x in text.split("TYPE=R\n")[1].splitlines()[0].split(",")]).reshape(2, 3)
     along = np.array([first, np.cross(np.cross(first, second), first), np.cross(first, second)])
@@ -294,7 +295,10 @@ def test_vtk_has_each_state_and_each_group(exported, model):
 def test_the_warp_takes_points_to_where_the_model_has_them(case_result, tmp_path, model):
     """Before's surfaces come to lie on after's, in the worlds of both images; the inverse takes them back."""
     shift = RigidMotion([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], [5.0, -3.0, 2.0])
-    result = dataclasses.replace(case_result, alignments=(Registration("surfaces", shift, np.zeros(3), 0.0),))
+    lay = dataclasses.replace(
+        case_result.pairs[0].later[0], alignment=Registration("surfaces", shift, np.zeros(3), 0.0)
+    )
+    result = with_first_pair(case_result, later=(lay,))
     palpate.export(result, tmp_path, format="warp")
     body = model.bodies[0]
     surface = np.unique(np.concatenate([body.space.facets(g.triangles) for g in face_groups(body.mesh)]))
@@ -319,7 +323,7 @@ def test_the_jacobian_of_a_warp_is_the_models_however_the_axes_of_the_image_lead
     index = nibabel.orientations.apply_orientation(before.index, turn)
     affine = before.grid.affine @ nibabel.orientations.inv_ornt_aff(turn, before.grid.shape)
     turned = dataclasses.replace(before, index=index, grid=VoxelGrid(index.shape, affine))
-    palpate.export(dataclasses.replace(case_result, before=turned), tmp_path, format="warp")
+    palpate.export(with_first_pair(case_result, before=turned), tmp_path, format="warp")
     field = SimpleITK.ReadImage(str(tmp_path / "warp.nii.gz"), SimpleITK.sitkVectorFloat64)
     found = SimpleITK.DisplacementFieldJacobianDeterminant(field)
     body, name = model.bodies[0], "bladder"

@@ -13,6 +13,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.mesh.space import lagrange_space
 from palpate.report import pictures
 from palpate.study.case import Images, Pair
+from palpate.study.imaged import LaterImage
 from palpate.study.result import PairResult
 
 AWAY = np.array([0.0, 0.0, 50.0])
@@ -43,8 +44,7 @@ def two_pairs(case_result):
         space=lagrange_space(dataclasses.replace(mesh, nodes=mesh.nodes + AWAY), "P2"),
         mesh_summary=case_result.mesh_summary,
         before=moved_away(case_result.before),
-        after=tuple(moved_away(image) for image in case_result.after),
-        displacements=estimation.displacements,
+        later=(LaterImage(2, moved_away(case_result.after[0])),),
     )
     return dataclasses.replace(
         case_result,
@@ -52,5 +52,5 @@ def two_pairs(case_result):
         estimation=dataclasses.replace(
             estimation, fits=2 * estimation.fits, displacements=2 * estimation.displacements
         ),
-        further=(pair,),
+        pairs=(*case_result.pairs, pair),
     )

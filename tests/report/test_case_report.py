@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from markupsafe import escape
 
+from bodies import with_first_pair
 from palpate.errors import InputDataError, NotConverged
 from palpate.findings import Finding
 from palpate.images.readers import write_scalar_image
@@ -148,10 +149,10 @@ def page_of_many(case_result):
     later = MOST_LATER + 1
     names = tuple(Path(f"later_{number}.nii.gz") for number in range(later))
     estimation = case_result.estimation
+    pair = case_result.pairs[0]
     result = dataclasses.replace(
-        case_result,
+        with_first_pair(case_result, later=later * pair.later),
         case=dataclasses.replace(case_result.case, images=dataclasses.replace(case_result.case.images, after=names)),
-        after=later * case_result.after,
         estimation=dataclasses.replace(
             estimation, fits=later * estimation.fits, displacements=later * estimation.displacements
         ),
@@ -181,9 +182,8 @@ def with_name(result, name):
     estimates = (first, *result.estimation.estimates[1:])
     case_tissues = (dataclasses.replace(result.case.tissues[0], name=name), *result.case.tissues[1:])
     return dataclasses.replace(
-        result,
+        with_first_pair(result, space=space),
         case=dataclasses.replace(result.case, id=name, tissues=case_tissues),
-        space=space,
         estimation=dataclasses.replace(result.estimation, estimates=estimates, reason=name),
         note=name,
     )

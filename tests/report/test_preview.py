@@ -60,7 +60,7 @@ def facts(page):
 def test_it_shows_who_is_who_how_all_lay_and_what_is_held(page, states):
     for tissue in states.before.tissues:
         assert re.search(rf'class="swatch"[^>]*></span>{tissue.name}</th>', page)
-    assert states.alignments[0].in_words in page
+    assert states.later[0].alignment.in_words in page
     assert re.search(r"after shows \d\d % of what before shows", page)
     assert "may move: each point by about" in page
     assert "towards the" in page
@@ -72,7 +72,7 @@ def test_a_later_image_that_lay_elsewhere_can_be_seen_as_it_lay(page, checked, s
     assert len(image["organs"]) == len(image["whole"]) == 3
     motion = np.array(image["motion"])
     assert motion[:, 3] == pytest.approx(ELSEWHERE.translation, abs=0.5)
-    still = dataclasses.replace(states, alignments=())
+    still = dataclasses.replace(states, later=(dataclasses.replace(states.later[0], alignment=None),))
     assert facts(page_of(dataclasses.replace(checked, states=(still,))))["preview"][0]["motion"] is None
 
 
@@ -91,7 +91,9 @@ def test_names_and_sentences_are_escaped(checked, states):
     hostile = dataclasses.replace(
         states,
         before=dataclasses.replace(states.before, tissues=tissues),
-        after=tuple(dataclasses.replace(image, tissues=tissues) for image in states.after),
+        later=tuple(
+            dataclasses.replace(of, image=dataclasses.replace(of.image, tissues=tissues)) for of in states.later
+        ),
     )
     page = page_of(dataclasses.replace(checked, states=(hostile,)), no_prediction=NASTY)
     assert "<img src=x" not in page

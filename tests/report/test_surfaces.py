@@ -7,12 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from bodies import with_first_pair
 from palpate.images.distance import observation_width, tissue_distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.report.pairs import bone_distances
 from palpate.report.surfaces import carried_outline, image_surface, model_surface, outer_first
+from palpate.study.imaged import LaterImage
 
 TURNED = np.array([[0, 1.5, 0, -5.0], [1.0, 0, 0, -5.0], [0, 0, -2.0, 50.0], [0, 0, 0, 1]])
 
@@ -103,7 +105,7 @@ def test_bones_are_as_far_off_as_they_were_shifted(case_result, shift):
     numbers = {"region": np.minimum(mesh.region, most), "beyond": np.minimum(mesh.beyond, most)}
     mesh = dataclasses.replace(mesh, tissues=rigid, **numbers)
     space = dataclasses.replace(case_result.space, mesh=mesh)
-    result = dataclasses.replace(case_result, space=space, before=before, after=(later,))
+    result = with_first_pair(case_result, space=space, before=before, later=(LaterImage(1, later),))
     surfaces = [(image_surface(image, 1, smoothing_mm=1.2),) for image in (before, later)]
     (bone,) = bone_distances(result, 0, *surfaces)
     # of a shifted ball: |cos| of the angle to the shift times that, half of it in the mean

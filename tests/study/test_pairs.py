@@ -98,7 +98,7 @@ def test_both_pairs_have_their_fit_mesh_and_digest_under_one_set_of_moduli(outpu
 
 def test_findings_on_a_further_pair_name_it_once(outputs, inputs):
     case = read_case(inputs / "case.toml", COARSE)
-    (states,) = read_pairs(case)
+    _, states = read_pairs(case)
     said = [warning["message"] for warning in json.loads((outputs / "result.json").read_text())["warnings"]]
     assert states.findings
     for finding in states.findings:

@@ -116,7 +116,7 @@ def test_a_prediction_is_near_what_the_estimate_then_says(states, prediction_of)
     """Within a factor of two, of the standard deviations of a case whose truths are those that were guessed."""
     case = case_of(coarse_balls())
     sought = [replace(t, youngs_modulus_kpa=None) if t.role is Role.ESTIMATE else t for t in case.tissues]
-    told = estimate_states(states, replace(case, tissues=tuple(sought))).estimation
+    told = estimate_states((states,), replace(case, tissues=tuple(sought))).estimation
     sd = np.sqrt(np.diag(told.covariance.total))
     ratio = widths(prediction_of()) / (2.0 * NORMAL_95 * sd)
     assert np.all((ratio > 0.5) & (ratio < 2.0))

@@ -55,7 +55,7 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     """
     make_folder(folder)
     paths = [folder / "mesh.vtu", folder / "stiffness.nii.gz"]
-    _write_fitted(paths[0], result, 0, result.space, result.displacements)
+    _write_fitted(paths[0], result, 0)
     grid, images = result.before.grid, result.stiffness_map()
     if result.estimation.maps:
         paths.append(folder / "stiffness_sd.nii.gz")
@@ -63,9 +63,9 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     for path, values in zip(paths[1:], images, strict=False):
         write_scalar_image(path, np.append(values, np.nan)[element], grid)  # -1, outside the mesh, takes the last entry
     paths += write_labels(result.before, folder)
-    for number, pair in enumerate(result.further, start=2):
-        paths.append(folder / f"mesh_{number}.vtu")
-        _write_fitted(paths[-1], result, number - 1, pair.space, pair.displacements)
+    for number in range(1, len(result.pairs)):
+        paths.append(folder / f"mesh_{number + 1}.vtu")
+        _write_fitted(paths[-1], result, number)
     if result.known is not None:
         paths.append(folder / KNOWN_IMAGES)
         write_archive(result.known, paths[-1], version=FORMAT)
@@ -79,18 +79,15 @@ def write_estimate_files(result: CaseResult, folder: Path) -> tuple[Path, ...]:
     return tuple(paths)
 
 
-def _write_fitted(
-    path: Path, result: CaseResult, pair: int, space: LagrangeSpace, displacements: tuple[NDArray[np.float64], ...]
-) -> None:
+def _write_fitted(path: Path, result: CaseResult, number: int) -> None:
     """The mesh of a pair with the moduli of the result and the last of its displacements."""
-    stiffness, sd, resolution = result.stiffness_map(pair)
+    pair, (stiffness, sd, resolution) = result.pairs[number], result.stiffness_map(number)
     extra = {} if result.unit == "kPa" else {"youngs_modulus_ratio": stiffness}
     if result.estimation.maps:
         extra |= {"ln_modulus_sd": sd, "resolution": resolution}
-    last = displacements[-1] if displacements else np.zeros_like(space.points)
+    last = [np.zeros_like(pair.space.points), *result.displacements_of(number)][-1]
     kilopascals = stiffness if result.unit == "kPa" else np.full_like(stiffness, np.nan)
-    cells = cell_data(space.mesh, kilopascals) | extra
-    write_moved(path, space, last, cells)
+    write_moved(path, pair.space, last, cell_data(pair.space.mesh, kilopascals) | extra)
 
 
 def write_moved(

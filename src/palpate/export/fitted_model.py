@@ -18,7 +18,7 @@ from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.study.case_data import CaseLoad
 from palpate.study.estimated import ModulusEstimate
-from palpate.study.result import CaseResult, PairResult
+from palpate.study.result import CaseResult
 from palpate.study.samples import ModulusSamples
 
 HIGHEST_RATIO = 0.4999  # Poisson's, that a case may have
@@ -151,23 +151,22 @@ def fitted_model(result: CaseResult, *, seal: str) -> FittedModel:
             f"the estimate ended with the status '{estimation.status}' ({estimation.reason}), so there is no model to"
             " export; an estimate that did not converge cannot be exported"
         )
-    pairs: list[tuple[CaseResult | PairResult, tuple[NDArray[np.float64], ...]]] = []
-    pairs += [(result, result.displacements)]
-    pairs += [(pair, pair.displacements) for pair in result.further]
-    numbers = np.cumsum([1, *(len(motions) for _, motions in pairs)]).tolist()
+    motions = [result.displacements_of(number) for number in range(len(result.pairs))]
+    numbers = np.cumsum([1, *map(len, motions)]).tolist()
     loads = [tuple(case.loads_in(n) for n in range(*ends)) for ends in pairwise(numbers)]
     materials = [estimation.materials[n - 1] if estimation.materials else None for n in numbers[:-1]]
     bodies = list[FittedBody]()
-    for (pair, displacements), acting, material in zip(pairs, loads, materials, strict=True):
+    for pair, moved, acting, material in zip(result.pairs, motions, loads, materials, strict=True):
         mesh, shifts = pair.space.mesh, material.poisson_shifts if material else {}
         ratios = [min(tissue.poisson_ratio + shifts.get(tissue.name, 0.0), HIGHEST_RATIO) for tissue in mesh.tissues]
         # the labels' own names are the image's
         own = (replace(t, called=(), poisson_ratio=ratio) for t, ratio in zip(mesh.tissues, ratios, strict=True))
-        alignments = tuple(found.motion.matrix for found in pair.alignments) or tuple(np.eye(4) for _ in displacements)
+        lay = (later.alignment for later in pair.later)
+        alignments = tuple(np.eye(4) if found is None else found.motion.matrix for found in lay)
         fitted = FittedBody(
             replace(mesh, tissues=tuple(own)),
             pair.space.order,
-            displacements or (np.zeros_like(pair.space.points),),
+            moved or (np.zeros_like(pair.space.points),),
             alignments or (np.eye(4),),
             pair.before.index,
             pair.before.grid,

@@ -27,22 +27,14 @@ class ImagePair:
 
 def image_pairs(result: CaseResult) -> tuple[ImagePair, ...]:
     """The first pair of the result, then its further ones."""
-    images = result.case.images
-    sources = result.case.pairs if images else ()
-    results = [result]
-    for pair, source in zip(result.further, sources, strict=False):
-        alone = replace(
-            result,
-            case=replace(result.case, images=Images(source.before, source.after), pairs=()),  # only labels are known
-            estimation=replace(result.estimation, displacements=pair.displacements),
-            space=pair.space,
-            mesh_summary=pair.mesh_summary,
-            before=pair.before,
-            after=pair.after,
-            alignments=pair.alignments,
-            further=(),
-        )
-        results.append(alone)
+    results = list[CaseResult]()
+    for number, pair in enumerate(result.pairs):
+        case = result.case
+        if number:  # of which only labels are known
+            source = case.pairs[number - 1]
+            case = replace(case, images=Images(source.before, source.after), pairs=())
+        own = replace(result.estimation, displacements=result.displacements_of(number))
+        results.append(replace(result, case=case, estimation=own, pairs=(pair,)))
     return tuple(
         ImagePair(one, before, tuple(after[k] if k < len(after) else f"after {k + 1}" for k in range(len(one.after))))
         for one, (before, after) in zip(results, pair_names(result.case), strict=False)

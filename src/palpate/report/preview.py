@@ -241,7 +241,7 @@ def _grey(case: Case, states: ImagedStates, after: int | None) -> Grey | None:
     if path is None:
         return None
     try:
-        return grey_of(path, states.alignments[after] if after is not None and states.alignments else None)
+        return grey_of(path, None if after is None else states.later[after].alignment)
     except InputDataError:  # a problem of the report, which says why
         return None
 
@@ -256,7 +256,7 @@ def _later(shown: _Shown, k: int, image: PreviewImage) -> Mapping[str, Any]:
     by_role = replace(data, tissues=tuple(replace(t, colour=ROLE_COLOURS.get(t.role, t.colour)) for t in data.tissues))
     backed = replace(by_role, references=(replace(reference, background=image.organs[0]),))
     both = replace(later, both=image.whole[:2])
-    found = states.alignments[k] if states.alignments else None
+    found = states.later[k].alignment
     first, second = frame.shared[k]
     lay = (
         "The images are taken as they lie; nothing was aligned." if found is None else f"{later.name} {found.in_words}."

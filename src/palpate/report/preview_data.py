@@ -87,8 +87,8 @@ def preview_image(
     greys: Sequence[Grey | None],
 ) -> PreviewImage:
     """What is drawn of later image number `after`; greys: of the first image and of this one, brought to it."""
-    before, aligned = states.before, states.after[after]
-    lay = None if not states.alignments or states.alignments[after].still else states.alignments[after].motion
+    before, aligned, found = states.before, states.after[after], states.later[after].alignment
+    lay = None if found is None or found.still else found.motion
     images = [before, aligned, *([] if lay is None else [moved(aligned, lay)])]
     whole = whole_box(before)
     arrows = [

@@ -36,7 +36,7 @@ SIDE_INCHES = 1.9
 def tissue_maps(result: CaseResult) -> tuple[TissueMap, ...]:
     """The maps of the first reference state, cut through the region that differs, or the tissue's middle."""
     mesh, found = result.space.mesh, list[TissueMap]()
-    for of in (of for of in result.estimation.maps if of.state < len(result.displacements)):
+    for of in (of for of in result.estimation.maps if of.state < len(result.pairs[0].later)):
         tissue = mesh.tissue_index(of.tissue)
         corners = mesh.nodes[mesh.tets[of.elements]].reshape(-1, 3)
         low, high = corners.min(axis=0) - ROOM_MM, corners.max(axis=0) + ROOM_MM

@@ -120,7 +120,7 @@ def later_grey(result: CaseResult, after: int) -> Grey | None:
     if images is None or after >= len(images.intensities_after):
         return None
     digest = result.provenance.inputs.get(f"intensities_after[{after}]")
-    found = result.alignments[after] if result.alignments else None
+    found = result.pairs[0].later[after].alignment
     return grey_of(images.intensities_after[after], found, sha256=digest)
 
 

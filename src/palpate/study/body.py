@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -112,7 +112,7 @@ def cost_of_bodies(bodies: Sequence[Body], case: Case) -> ExpectedCost:
     """What an estimate on the very meshes of these bodies costs."""
     sizes = [(body.quality.tets, 3 * len(body.space.points)) for body in bodies]
     first = bodies[0].states
-    return cost_of_meshes(case, first.before, sizes, n_after=first.n_later)
+    return cost_of_meshes(case, first.before, sizes, n_after=len(first.later))
 
 
 def strained_body(body: Body, strained: NDArray[np.float64], case: Case) -> Body:
@@ -171,20 +171,13 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress, ear
     bodies = [body if body.layers == shared else _remade(body, case, layers=shared) for body in bodies]
     progress("distances to the surfaces of all images")
     noise = stated_noise(case)
-    shown = [  # nothing of states that are not imaged
-        observations(body.imaged(noise)) if body.states.after else tuple(() for _ in body.states.bones)
-        for body in bodies
-    ]
-    imaged = [(r, o) for r, of_body in enumerate(shown) for o in of_body]
-    measured = [of for body in bodies for of in body.measured]
-    seen = [(r, (*o, *(term for s, term in measured if s == n))) for n, (r, o) in enumerate(imaged, start=1)]
+    seen = [(r, observed) for r, body in enumerate(bodies) for observed in _observed(body, noise)]
     progress("assembling the stiffness matrix of each tissue")
-    numbers = np.cumsum([0, *(body.states.n_later for body in bodies)]).tolist()
-    pairs = [pair for body, first in zip(bodies, numbers, strict=False) for pair in _models(body, case, first)]
+    pairs = [pair for body in bodies for pair in _models(body, case)]
     models = tuple(model for model, _ in pairs)
     if not case.known_force and not any(motion.walls or model.constraint.offset.any() for model, motion in pairs):
         raise ConfigurationError(NOTHING_MOVES)  # at rest every modulus explains the images equally badly
-    strained = [body.strained for body in bodies for _ in range(body.states.n_later)]
+    strained = [body.strained for body in bodies for _ in body.states.later]
     finite = _finite_strain(models, strained, case)
     drawn = _drawn_at_rest(seen, earlier)
     states = tuple(
@@ -194,6 +187,14 @@ def joint_problem(bodies: Sequence[Body], case: Case, *, progress: Progress, ear
     blocks = _blocks(case, bodies[0], pairs, seen, drawn)
     tissues, regions = models[0].space.mesh.tissues, models[0].regions
     return InverseProblem(states, parameter_map(tissues, regions, blocks, loaded=case.known_force))
+
+
+def _observed(body: Body, stated_noise: NoiseModel | None) -> Iterator[tuple[Observation, ...]]:
+    """What is observed of each later state: surfaces, where it is imaged, and what was measured."""
+    later, imaged = body.states.later, iter(observations(body.imaged(stated_noise)) if body.states.after else ())
+    for of in later:
+        surfaces = next(imaged) if of.image is not None else ()
+        yield (*surfaces, *(term for number, term in body.measured if number == of.number))
 
 
 def _blocks(
@@ -282,26 +283,23 @@ def stated_noise(case: Case) -> NoiseModel | None:
     return NoiseModel(np.array([2.0 * case.noise.surface_sd_mm**2]), np.array([length]))
 
 
-def _models(body: Body, case: Case, first: int) -> list[tuple[LinearModel, PrescribedMotion]]:
-    """One model a later image, and what is prescribed; they share the stiffness and differ in their conditions.
-
-    first: number of later states of the bodies before this one.
-    """
+def _models(body: Body, case: Case) -> list[tuple[LinearModel, PrescribedMotion]]:
+    """One model a later image, and what is prescribed; they share the stiffness and differ in their conditions."""
     models: list[tuple[LinearModel, PrescribedMotion]] = []
     moving, domain = case.domain.outer_boundary == "moving", case.domain
     frame = FrameMotion(domain.outer_motion_mm, domain.outer_kernel_mm) if moving else None
     dilatation, layered = choose_element(case.mechanics.element).dilatation, body.layered
-    for state, bones in enumerate(body.states.bones, start=first + 1):
-        loads = case_loads(case, body.space, state)
+    for later in body.states.later:
+        loads = case_loads(case, body.space, later.number)
         if models:  # the same walls and frame, which move otherwise
             model, motion = models[0]
-            motion = replace(motion, offset=bone_offset(body.space, bones))
+            motion = replace(motion, offset=bone_offset(body.space, later.bones))
             constraint = replace(model.constraint, offset=motion.offset)
             models.append((model.under(Conditions(constraint, loads)), motion))
             continue
         motion = prescribed_motion(
             body.space,
-            bones,
+            later.bones,
             n_modes=case.driver.modes,
             kernel_mm=case.driver.kernel_mm,
             prior_mm=case.driver.prior_mm,

@@ -11,7 +11,18 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import law_from, law_parameters
 from palpate.mechanics.solvers.registry import SOLVERS
 from palpate.observation.contract import DataFile
-from palpate.study.case_body import AUTO, LAW_NAMES, SEED, CaseSurface, Images, MeshBody, Motion, Pair, Phantom
+from palpate.study.case_body import (
+    AUTO,
+    LAW_NAMES,
+    SEED,
+    CaseSurface,
+    ImagePair,
+    Images,
+    MeshBody,
+    Motion,
+    Pair,
+    Phantom,
+)
 from palpate.study.case_data import CaseData, CaseLoad
 from palpate.study.case_tissue import KILOPASCALS, REMAINING, CaseTissue, refuse_name
 from palpate.study.schema import rule, shown
@@ -276,12 +287,22 @@ class Case:
         return tuple(data.named(name) for data, name in zip(self.data, names, strict=True))
 
     @property
+    def image_pairs(self) -> tuple[ImagePair, ...]:
+        """The pair of [images], then those of [[pairs]]; none where no image is named."""
+        found, first = list[ImagePair](), 1
+        named = [] if self.images is None else [(self.images.before, self.images.after, "")]
+        named += [(pair.before, pair.after, f"pairs[{number}].") for number, pair in enumerate(self.pairs)]
+        for before, after, key in named:
+            found.append(ImagePair(before, after, key, range(first, first + len(after))))
+            first += len(after)
+        return tuple(found)
+
+    @property
     def n_states(self) -> int:
         """Number of later states: of the later images of all pairs, or the one that is simulated."""
         if self.body is not None:
             return max([1, *(data.state for data in self.data), *(load.state or 1 for load in self.loads)])
-        further = sum(len(pair.after) for pair in self.pairs)
-        return max(len(self.images.after) if self.images else 0, 1) + further
+        return max(1, sum(len(pair.after) for pair in self.image_pairs))
 
     def loads_in(self, state: int) -> tuple[CaseLoad, ...]:
         """The known loads of the reference state, 0, or what changes from them to the later state with a number."""

@@ -87,6 +87,25 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True)
+class ImagePair:
+    """A reference image of a case with its later images.
+
+    key: how the keys of its files begin in `result.json`; numbers: of its later states in the case, from 1.
+    """
+
+    before: Path
+    after: tuple[Path, ...]
+    key: str
+    numbers: range
+
+    @property
+    def paths(self) -> dict[str, Path]:
+        """Its files by their keys."""
+        later = {f"{self.key}after[{i}]": path for i, path in enumerate(self.after)}
+        return {f"{self.key}before": self.before} | later
+
+
+@dataclass(frozen=True, slots=True)
 class Phantom:
     """A scene with a known truth instead of images; `law`: that of the truth (default: the case's).
 

@@ -40,7 +40,7 @@ from palpate.study.cost import (
     lack_of_memory,
     machine_memory_gb,
 )
-from palpate.study.imaged import ImagedStates, brought
+from palpate.study.imaged import ImagedStates, LaterImage, brought
 from palpate.study.plausibility import unit_warnings
 from palpate.study.prediction import Prediction
 from palpate.study.provenance import file_digest
@@ -268,7 +268,8 @@ def checked_case(
     found = [
         (f"pair {n}: {name}" if n > 1 else name, one)
         for n, pair in enumerate(pairs, start=1)
-        for name, one in zip(later_names(len(pair.after)), pair.alignments, strict=False)
+        for name, one in zip(later_names(len(pair.later)), (later.alignment for later in pair.later), strict=True)
+        if one is not None
     ]
     files = [(source.file, source.in_words) for pair in pairs for source in pair.data]
     measured_words = {f.name + (f", state {f.state}" if f.state > 1 else ""): words for f, words in files}
@@ -315,9 +316,6 @@ def _cost(
     return cost, () if problems.refused else made
 
 
-Pair = tuple[Segmentation, tuple[Segmentation, ...]]
-
-
 def _further_problems(problems: _Problems, case: Case, progress: Progress) -> tuple[ImagedStates, ...]:
     """All states that can be made of a case that an estimate refuses, with every check made on each of them."""
     problems.attempt(partial(require_samples, case))
@@ -325,12 +323,11 @@ def _further_problems(problems: _Problems, case: Case, progress: Progress) -> tu
         states = problems.attempt(partial(read_states, case, progress=progress))
         problems.warn(() if states is None else states.findings)
         return () if states is None else (states,)
-    found, first = list[ImagedStates](), 0
-    for before, after in _read_pairs(case, problems):
-        states = _checked_pair(problems, ImagedStates(before, after, (), ()), case, len(found) + 1, progress)
-        data = problems.attempt(partial(measured, case, states, first=first))
-        found.append(states if data is None else replace(states, data=data[0]))
-        first += states.n_later
+    found = list[ImagedStates]()
+    for states in _read_pairs(case, problems):
+        checked = _checked_pair(problems, states, case, len(found) + 1, progress)
+        data = problems.attempt(partial(measured, case, checked))
+        found.append(checked if data is None else replace(checked, data=data[0]))
     return tuple(found)
 
 
@@ -339,7 +336,7 @@ def _grey_images(case: Case) -> tuple[Path, ...]:
     return () if images is None else tuple(g for g in (images.intensities_before, *images.intensities_after) if g)
 
 
-def _read_pairs(case: Case, problems: _Problems) -> list[Pair]:
+def _read_pairs(case: Case, problems: _Problems) -> list[ImagedStates]:
     """Every pair whose reference state can be read, with those later states that can; each file is tried."""
     images = case.images
     if images is None:
@@ -348,13 +345,15 @@ def _read_pairs(case: Case, problems: _Problems) -> list[Pair]:
     names = problems.attempt(lambda: read_label_table(table)) if table else None
     for grey in _grey_images(case):
         problems.attempt(partial(file_digest, grey))
-    pairs: list[Pair] = []
-    for reference, later in ((images.before, images.after), *((pair.before, pair.after) for pair in case.pairs)):
-        before = problems.attempt(partial(read_segmentation, case, reference, names, None))
-        tissues = before.tissues if before else None
-        after = [problems.attempt(partial(read_segmentation, case, path, names, tissues)) for path in later]
+    pairs = list[ImagedStates]()
+    for pair in case.image_pairs:
+        before = problems.attempt(partial(read_segmentation, case, pair.before, names, None))
+        tissues, later = before.tissues if before else None, list[LaterImage]()
+        for number, path in zip(pair.numbers, pair.after, strict=True):
+            image = problems.attempt(partial(read_segmentation, case, path, names, tissues))
+            later += [] if image is None else [LaterImage(number, image)]
         if before is not None:
-            pairs.append((before, tuple(image for image in after if image is not None)))
+            pairs.append(ImagedStates(before, tuple(later)))
     return pairs
 
 
@@ -365,16 +364,17 @@ def _checked_pair(
 
     An organ that is absent is named, and left out of the other checks; the images are then not aligned.
     """
-    before, after = states.before, states.after
+    before, after, there = states.before, states.after, None
     for name, image in zip(("before", *later_names(len(after))), (before, *after), strict=True):
         problems.attempt(partial(refuse_unit, image.grid, name))
     problems.attempt(partial(refuse_absent, before, after))
     absent = set(absent_tissues(before, after))
     if not absent:
-        states = problems.attempt(partial(brought, before, after, method=case.align, progress=progress)) or states
-        problems.warn(states.findings, number)
-    in_place = bool(states.bones) or not any(tissue.role is Role.RIGID for tissue in before.tissues)
-    before, after = _without(before, absent), tuple(_without(image, absent) for image in states.after)
+        there = problems.attempt(partial(brought, before, after, method=case.align, progress=progress))
+        problems.warn(there.findings if there else (), number)
+    in_place = there is not None or not any(tissue.role is Role.RIGID for tissue in before.tissues)
+    lay = tuple(of.alignment for of in there.later) if there else (None,) * len(after)
+    before, after = _without(before, absent), tuple(_without(image, absent) for image in (there or states).after)
     problems.warn(check_segmentation(before, "before"), number)
     problems.attempt(partial(refuse_unmeshable, before, "before"))
     for name, image in zip(later_names(len(after)), after, strict=True):
@@ -387,7 +387,9 @@ def _checked_pair(
             findings = problems.attempt(partial(check_pair, before, image, name=name), place=place)
             problems.warn(findings or (), number)
     problems.warn(every_finding(before, after, loaded=bool(case.loads)), number)
-    return replace(states, before=before, after=after)
+    every = zip(states.later, after, lay, strict=True)
+    later = tuple(replace(of, image=image, alignment=alignment) for of, image, alignment in every)
+    return replace(states, before=before, later=later)
 
 
 def _without(image: Segmentation, absent: Collection[int]) -> Segmentation:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import count
 
 import numpy as np
 
@@ -33,27 +34,38 @@ STATED = (
 
 
 @dataclass(frozen=True, slots=True)
-class ImagedStates:
-    """The reference state and the later states, brought to it; `bones`: each later state's motions by tissue index.
+class LaterImage:
+    """A later state, with its number in the case, from 1: its image, brought to the first; None where it has none.
 
-    `inputs`: SHA-256 of each file that was read for them, by its key in `result.json`; `alignments`: how each later
-    state lay before it was brought to the first; none where nothing was aligned; `data`: measurements beside the
-    images; `mesh`: where the body is given as one, and no later state is imaged.
+    bones: motions of what is moved as prescribed, by tissue index; alignment: how the image lay before; None where
+    nothing was aligned.
+    """
+
+    number: int
+    image: Segmentation | None = None
+    bones: Mapping[int, Motion] = field(default_factory=dict)
+    alignment: Registration | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ImagedStates:
+    """The reference state of a body and its later states.
+
+    inputs: SHA-256 of each file that was read for them, by its key in `result.json`; data: measurements beside the
+    images; mesh: where the body is given as one, and no later state is imaged.
     """
 
     before: Segmentation
-    after: tuple[Segmentation, ...]
-    bones: tuple[Mapping[int, Motion], ...]
-    findings: tuple[Finding, ...]
+    later: tuple[LaterImage, ...]
+    findings: tuple[Finding, ...] = ()
     inputs: Mapping[str, str] = field(default_factory=dict)
     data: tuple[DataSource, ...] = ()
-    alignments: tuple[Registration, ...] = ()
     mesh: TetMesh | None = None
 
     @property
-    def n_later(self) -> int:
-        """Number of later states, imaged or not."""
-        return max(len(self.bones), len(self.after))
+    def after(self) -> tuple[Segmentation, ...]:
+        """The later images that there are."""
+        return tuple(of.image for of in self.later if of.image is not None)
 
     def volumes(self, tissue: int) -> tuple[float, ...]:
         """Volume (mm^3) of a tissue in each image, or that of its tetrahedra in a body that is given as a mesh."""
@@ -61,30 +73,27 @@ class ImagedStates:
             return (float(self.mesh.volumes[self.mesh.region == tissue].sum()),)
         return tuple(image.volume(tissue) for image in (self.before, *self.after))
 
-    @property
-    def later(self) -> tuple[Segmentation | None, ...]:
-        """The image of each later state, None where there is none."""
-        return self.after or (None,) * self.n_later
-
 
 def aligned(
     before: Segmentation,
     after: tuple[Segmentation, ...],
     *,
     method: str,
+    first: int = 1,
     loaded: bool = False,
     progress: Progress = silent,
 ) -> ImagedStates:
     """Bring the later images to the first (`method`: "rigid-tissues", "surfaces" or "none") and check them all.
 
-    `loaded`: whether known loads act on the body, for what is found of its motion.
+    first: number of the first of them in the case; loaded: whether known loads act on the body, for what is found of
+    its motion.
     Raises `InputDataError` as `refuse_unit`, `refuse_absent`, `align`, `check_images` and `refuse_lost` do,
     `GeometryError` as `refuse_unmeshable`.
     """
     for name, image in zip(("before", *later_names(len(after))), (before, *after), strict=True):
         refuse_unit(image.grid, name)
     refuse_absent(before, after)
-    found = brought(before, after, method=method, progress=progress)
+    found = brought(before, after, method=method, first=first, progress=progress)
     progress("checking the images")
     findings, images = [*found.findings, *check_images(before, found.after)], found.after
     refuse_unmeshable(before, "before")
@@ -96,37 +105,38 @@ def aligned(
 
 
 def brought(
-    before: Segmentation, after: tuple[Segmentation, ...], *, method: str, progress: Progress = silent
+    before: Segmentation, after: tuple[Segmentation, ...], *, method: str, first: int = 1, progress: Progress = silent
 ) -> ImagedStates:
     """Bring the later images to the first as `aligned` does, but check nothing besides their headers.
 
     Raises `InputDataError` as `align` and `align_surfaces`.
     """
-    images, bones, findings, alignments = [], [], list[Finding](), list[Registration]()
+    later, findings = list[LaterImage](), list[Finding]()
     maps: SurfaceMaps | None = None
+    named = list(zip(later_names(len(after)), after, strict=True))
     if method == "none":
-        for name, image in zip(later_names(len(after)), after, strict=True):
+        for name, image in named:
             progress(f"looking for a motion of the whole in '{name}'")
             findings += check_headers(before.grid, image.grid, name)
             with suppress(InputDataError):  # too little is seen for a motion of the whole; nothing rests on it here
                 maps = surface_maps(before, image, maps)
                 found = registration(before, maps, align_surfaces(before, maps), by="surfaces")
                 findings += _frame_findings(before, found, name, aligned=False)
-        return ImagedStates(before, after, tuple(dict[int, Motion]() for _ in after), tuple(findings))
+        return ImagedStates(before, tuple(map(LaterImage, count(first), after)), tuple(findings))
     rigid = {i: t.name for i, t in enumerate(before.tissues) if t.role is Role.RIGID}
-    for name, image in zip(later_names(len(after)), after, strict=True):
+    for number, (name, image) in enumerate(named, start=first):
         progress(f"aligning '{name}' on {ON[method]}")
         findings += check_headers(before.grid, image.grid, name)
         alignment = align(before, image) if rigid or method == "rigid-tissues" else None
         maps = surface_maps(before, image, maps)
         fit = alignment.overall if alignment and method == "rigid-tissues" else align_surfaces(before, maps)
-        alignments.append(registration(before, maps, fit, by=method))
-        progress(f"'{name}' {alignments[-1].in_words}")
-        images.append(moved(image, fit.motion.inverse()))
-        bones.append({i: alignment.remaining(bone, fit) for i, bone in rigid.items()} if alignment else {})
+        lay = registration(before, maps, fit, by=method)
+        progress(f"'{name}' {lay.in_words}")
+        bones = {i: alignment.remaining(bone, fit) for i, bone in rigid.items()} if alignment else {}
+        later.append(LaterImage(number, moved(image, fit.motion.inverse()), bones, lay))
         findings += alignment_findings(alignment, name) if alignment else []
-        findings += _frame_findings(before, alignments[-1], name)
-    return ImagedStates(before, tuple(images), tuple(bones), tuple(findings), alignments=tuple(alignments))
+        findings += _frame_findings(before, lay, name)
+    return ImagedStates(before, tuple(later), tuple(findings))
 
 
 def _frame_findings(before: Segmentation, found: Registration, name: str, *, aligned: bool = True) -> list[Finding]:

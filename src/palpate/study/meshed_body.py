@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding
-from palpate.images.alignment import Motion
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
@@ -28,7 +27,7 @@ from palpate.progress import Progress
 from palpate.study.case import Case
 from palpate.study.case_body import MeshBody
 from palpate.study.case_tissue import REMAINING, CaseTissue
-from palpate.study.imaged import ImagedStates
+from palpate.study.imaged import ImagedStates, LaterImage
 from palpate.study.schema import nearest, shown
 
 OUTSIDE = "outside"
@@ -47,9 +46,8 @@ def mesh_states(body: MeshBody, case: Case, *, progress: Progress) -> ImagedStat
     mesh = _mesh(file, case)
     grid = _grid_around(mesh)
     index = voxelise(lagrange_space(mesh, "P1"), np.zeros_like(mesh.nodes), grid, crossing=True)
-    bones = tuple(dict[int, Motion]() for _ in range(case.n_states))
-    before = Segmentation(index, grid, mesh.tissues)
-    return ImagedStates(before, (), bones, findings, inputs={"mesh": file.digest}, mesh=mesh)
+    before, later = Segmentation(index, grid, mesh.tissues), map(LaterImage, range(1, case.n_states + 1))
+    return ImagedStates(before, tuple(later), findings, inputs={"mesh": file.digest}, mesh=mesh)
 
 
 def _grid_around(mesh: TetMesh) -> VoxelGrid:
@@ -70,20 +68,20 @@ def with_prescribed(states: ImagedStates, case: Case) -> ImagedStates:
     surfaces = [surface.name for surface in case.surfaces if surface.boundary == "prescribed"]
     if states.mesh is None or not surfaces:
         return states
-    mesh, found = states.mesh, list[Mapping[int, Motion]]()
+    mesh, found = states.mesh, list[LaterImage]()
     names = [tissue.name for tissue in mesh.tissues]
-    for state in range(1, states.n_later + 1):
-        points = [of for of in states.data if isinstance(of, MeasuredPoints) and of.file.state == state]
+    for later in states.later:
+        points = [of for of in states.data if isinstance(of, MeasuredPoints) and of.file.state == later.number]
         if not points:
             raise ConfigurationError(
-                f"'{surfaces[0]}' is prescribed, and no [[data]] of state {state} says where its points moved; add such"
-                " data"
+                f"'{surfaces[0]}' is prescribed, and no [[data]] of state {later.number} says where its points moved;"
+                " add such data"
             )
         motion = MeasuredMotion(points, case.driver.kernel_mm, case.driver.prior_mm)
         for name in surfaces:
             motion.require(mesh.nodes[np.unique(boundary_named(mesh, name))], name)
-        found.append({names.index(name): motion for name in surfaces})
-    return replace(states, bones=tuple(found))
+        found.append(replace(later, bones={names.index(name): motion for name in surfaces}))
+    return replace(states, later=tuple(found))
 
 
 def _findings(file: MeshFile, case: Case) -> tuple[Finding, ...]:

@@ -78,12 +78,11 @@ def pair_names(case: Case) -> list[tuple[str, tuple[str, ...]]]:
         return [("body", tuple(f"state {number}" for number in range(1, case.n_states + 1)))]
     if case.images is None:
         return [("before", ("after",))]
-    pairs = [(case.images.before, case.images.after), *((pair.before, pair.after) for pair in case.pairs)]
-    paths = [path for before, after in pairs for path in (before, *after)]
+    paths = [path for pair in case.image_pairs for path in pair.paths.values()]
     names = [path.name for path in paths]
     for depth in range(2, max(len(path.parts) for path in paths) + 1):  # folders, to tell two of one name apart
         alike = [name for name in names if names.count(name) > 1]
         deeper = ["/".join(path.parts[-depth:]) for path in paths]
         names = [longer if name in alike else name for name, longer in zip(names, deeper, strict=True)]
     left = iter(names)
-    return [(next(left), tuple(next(left) for _ in after)) for _, after in pairs]
+    return [(next(left), tuple(next(left) for _ in pair.after)) for pair in case.image_pairs]

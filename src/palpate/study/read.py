@@ -22,6 +22,7 @@ from palpate.phantoms.scene import Scene
 from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy
 from palpate.progress import Progress, silent
 from palpate.study.case import Case
+from palpate.study.case_body import ImagePair
 from palpate.study.imaged import ImagedStates, aligned
 from palpate.study.meshed_body import mesh_states, with_prescribed
 from palpate.study.provenance import file_digest, input_digests
@@ -46,13 +47,13 @@ def read_case_images(case: Case, *, progress: Progress = silent) -> CaseImages:
     """
     refuse_what_cannot_be_estimated(case)
     require_samples(case)
-    pairs = (read_states(case, progress=progress), *read_pairs(case, progress=progress))
-    refuse_still(case, *((pair.before, pair.bones) for pair in pairs))
+    pairs = read_pairs(case, progress=progress)
+    refuse_still(case, *((pair.before, [later.bones for later in pair.later]) for pair in pairs))
     return CaseImages(pairs, input_digests(case, *(pair.inputs for pair in pairs)))
 
 
 def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:
-    """Segmentations of the reference state and of the later states, aligned and checked.
+    """Segmentations of the first reference state and of its later states, aligned and checked.
 
     Raises `InputDataError` for images that cannot be used, `ConfigurationError` for tissues that do not fit them.
     """
@@ -62,20 +63,16 @@ def read_states(case: Case, *, progress: Progress = silent) -> ImagedStates:
         return aligned(segment(scene.before, scene.tissues), after, method=case.align, loaded=bool(case.loads))
     if case.body is not None:
         states = mesh_states(case.body, case, progress=progress)
-        return with_prescribed(_with_measured(states, case, first=0, progress=progress), case)
+        return with_prescribed(_with_measured(states, case, progress=progress), case)
     if case.images is None:
         raise ConfigurationError(f"case '{case.id}' has neither [images] nor [phantom]")
-    return _read_pair(case, case.images.before, case.images.after, key="", first=0, progress=progress)
+    return _read_pair(case, case.image_pairs[0], progress=progress)
 
 
 def read_pairs(case: Case, *, progress: Progress = silent) -> tuple[ImagedStates, ...]:
-    """The same of each of the case's further [[pairs]]."""
-    found, first = [], len(case.images.after) if case.images else 0
-    for number, pair in enumerate(case.pairs):
-        key = f"pairs[{number}]."
-        found.append(_read_pair(case, pair.before, pair.after, key=key, first=first, progress=progress))
-        first += len(pair.after)
-    return tuple(found)
+    """The same of every pair of a case."""
+    further = (_read_pair(case, pair, progress=progress) for pair in case.image_pairs[1:])
+    return (read_states(case, progress=progress), *further)
 
 
 def read_segmentation(
@@ -137,46 +134,43 @@ def phantom_scene(case: Case) -> Scene:
     return spheres(replace(options, push_mm=case.motion.filling_mm) if case.motion else options)
 
 
-def measured(case: Case, states: ImagedStates, *, first: int) -> tuple[tuple[DataSource, ...], dict[str, str]]:
-    """The [[data]] of later states that are numbered after `first`, brought to the first image, and files' digests.
+def measured(case: Case, states: ImagedStates) -> tuple[tuple[DataSource, ...], dict[str, str]]:
+    """The [[data]] of the later states, brought to the first image, and the digests of their files.
 
     Raises `InputDataError` for files that cannot be used, or that the images contradict.
     """
-    found, digests = [], {}
+    found, digests, numbered = [], {}, {later.number: later for later in states.later}
     for number, file in enumerate(case.data_files):
-        place = file.state - first - 1
-        if not 0 <= place < states.n_later:
+        if (later := numbered.get(file.state)) is None:
             continue
         source = read_source(file)
         for part, digest in enumerate(source.digests):
             digests[f"data[{number}]" + (f".{part}" if part else "")] = digest
-        source = source.brought(states.alignments[place].motion) if states.alignments else source
-        if states.after:
-            source.against(states.before, states.after[place])
+        source = source.brought(later.alignment.motion) if later.alignment else source
+        if later.image is not None:
+            source.against(states.before, later.image)
         found.append(source)
     return tuple(found), digests
 
 
-def _read_pair(
-    case: Case, before: Path, after: tuple[Path, ...], *, key: str, first: int, progress: Progress
-) -> ImagedStates:
-    """One pair; `key` begins the keys of its files' digests, `first`: number of later states before its own."""
+def _read_pair(case: Case, pair: ImagePair, *, progress: Progress) -> ImagedStates:
+    """One pair of a case."""
     table = case.images.names if case.images else None
     names = read_label_table(table) if table else None
-    reference = read_segmentation(case, before, names, None)
-    later = tuple(read_segmentation(case, path, names, reference.tissues) for path in after)
-    states = aligned(reference, later, method=case.align, loaded=bool(case.loads), progress=progress)
+    reference = read_segmentation(case, pair.before, names, None)
+    later = tuple(read_segmentation(case, path, names, reference.tissues) for path in pair.after)
+    first, loaded = pair.numbers.start, bool(case.loads)
+    states = aligned(reference, later, method=case.align, first=first, loaded=loaded, progress=progress)
     inputs = {"names": names.sha256} if names else {}
-    keys = (f"{key}before", *(f"{key}after[{i}]" for i in range(len(later))))
-    for name, image, path in zip(keys, (reference, *later), (before, *after), strict=True):
+    for (key, path), image in zip(pair.paths.items(), (reference, *later), strict=True):
         digests = image.digests or {"": file_digest(path)}  # a reader from elsewhere may not say what it read
-        inputs |= {f"{name}.{part}" if part else name: digest for part, digest in digests.items()}
-    return _with_measured(replace(states, inputs=inputs), case, first=first, progress=progress)
+        inputs |= {f"{key}.{part}" if part else key: digest for part, digest in digests.items()}
+    return _with_measured(replace(states, inputs=inputs), case, progress=progress)
 
 
-def _with_measured(states: ImagedStates, case: Case, *, first: int, progress: Progress) -> ImagedStates:
-    """The states with the measurements of those that are numbered after `first`."""
-    data, digests = measured(case, states, first=first)
+def _with_measured(states: ImagedStates, case: Case, *, progress: Progress) -> ImagedStates:
+    """The states with their measurements."""
+    data, digests = measured(case, states)
     for source in data:
         progress(f"{source.file.name}: {source.in_words}")
     return replace(states, inputs={**states.inputs, **digests}, data=data)

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from palpate.errors import NotConverged, PalpateError
 from palpate.findings import Finding, one_a_cause, warning_rows
 from palpate.images.label_image import LabelImage
-from palpate.images.registration import Registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.quality import MeshQuality
@@ -26,6 +25,7 @@ from palpate.study.case_tissue import CaseTissue
 from palpate.study.discrepancy import FoundDiscrepancy
 from palpate.study.edge_length import EdgeLength
 from palpate.study.estimated import Estimation, ModulusEstimate, StatedExplanation, no_estimate
+from palpate.study.imaged import LaterImage
 from palpate.study.known_images import BuiltOn, KnownImages
 from palpate.study.map_words import map_words
 from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
@@ -71,43 +71,40 @@ class Provenance:
 
 @dataclass(frozen=True, slots=True)
 class PairResult:
-    """A further pair of images, which shares the moduli: its own mesh, its segmentations, its displacements.
+    """A reference state with its later states: its mesh and its images.
 
-    displacements: one (n_points, 3) mm on `space.points` a later image; before, after, alignments: as in `CaseResult`.
+    space: the displacements' points on the mesh; before: segmentation; later: its later states, their images brought to
+    the first, all in RAS mm.
     """
 
     space: LagrangeSpace
     mesh_summary: MeshSummary
     before: Segmentation
-    after: tuple[Segmentation, ...]
-    displacements: tuple[NDArray[np.float64], ...]
-    alignments: tuple[Registration, ...] = ()
+    later: tuple[LaterImage, ...]
+
+    @property
+    def after(self) -> tuple[Segmentation, ...]:
+        """The later images that there are."""
+        return tuple(of.image for of in self.later if of.image is not None)
 
 
 @dataclass(frozen=True, slots=True)
 class CaseResult:
     """The whole outcome of one estimate.
 
-    space: the displacements' points on the mesh of the reference state; before, after: segmentations, the later ones
-    brought to the first (aligned), all in RAS mm; remarks: those of the study, beside the estimation's own;
+    pairs: each reference state with its later states; the estimation has theirs one after the other;
+    remarks: those of the study, beside the estimation's own;
     note: a sentence that must stand wherever the numbers are shown (of what a demo simulates, say);
     known: what its images tell, for others that are added, None where none may be; built_on: the estimate that they
-    were added to, the case is then that of the added images;
-    further: the pairs after the first. The estimation's fits and displacements are those of `after`, then theirs;
-    alignments: how each of `after` lay in its own image; empty where nothing was aligned.
+    were added to, the case is then that of the added images.
     """
 
     case: Case
     estimation: Estimation
-    space: LagrangeSpace
-    mesh_summary: MeshSummary
-    before: Segmentation
-    after: tuple[Segmentation, ...]
+    pairs: tuple[PairResult, ...]
     provenance: Provenance
     remarks: tuple[Finding, ...] = ()
     note: str = ""
-    further: tuple[PairResult, ...] = ()
-    alignments: tuple[Registration, ...] = ()
     known: KnownImages | None = None
     built_on: BuiltOn | None = None
 
@@ -122,20 +119,39 @@ class CaseResult:
         return self.space.mesh.tissues
 
     @property
+    def space(self) -> LagrangeSpace:
+        """The points of displacements on the mesh of the first reference state."""
+        return self.pairs[0].space
+
+    @property
+    def mesh_summary(self) -> MeshSummary:
+        """Size and quality of that mesh."""
+        return self.pairs[0].mesh_summary
+
+    @property
+    def before(self) -> Segmentation:
+        """The first reference image."""
+        return self.pairs[0].before
+
+    @property
+    def after(self) -> tuple[Segmentation, ...]:
+        """Its later images, brought to it."""
+        return self.pairs[0].after
+
+    @property
     def displacements(self) -> tuple[NDArray[np.float64], ...]:
         """Displacements (n_points, 3) mm of the first reference state, one for each later state."""
-        motions = self.estimation.displacements
-        return motions[: len(motions) - sum(len(pair.displacements) for pair in self.further)]
+        return self.displacements_of(0)
+
+    def displacements_of(self, pair: int) -> tuple[NDArray[np.float64], ...]:
+        """Those of a pair, by its number from 0; none where nothing was found."""
+        first = sum(len(before.later) for before in self.pairs[:pair])
+        return self.estimation.displacements[first : first + len(self.pairs[pair].later)]
 
     @property
     def all_remarks(self) -> tuple[Finding, ...]:
         """Warnings of the study and of the estimation, one for each cause, the most harmful first."""
         return one_a_cause((*self.remarks, *self.estimation.remarks))
-
-    @property
-    def every_alignment(self) -> tuple[Registration, ...]:
-        """How each later image of all pairs lay, in the order of the case; empty where nothing was aligned."""
-        return (*self.alignments, *(found for pair in self.further for found in pair.alignments))
 
     @property
     def unit(self) -> str:
@@ -156,16 +172,12 @@ class CaseResult:
 
         Of tissues that are not mapped those of the tissue, NaN and NaN.
         """
-        bodies = [
-            (self.space, self.displacements),
-            *((further.space, further.displacements) for further in self.further),
-        ]
-        mesh = bodies[pair][0].mesh
-        first = sum(len(motions) for _, motions in bodies[:pair])
+        mesh = self.pairs[pair].space.mesh
+        first = sum(len(before.later) for before in self.pairs[:pair])
         stiffness, sd = self.stiffness[mesh.region], np.full(len(mesh.region), np.nan)
         resolution = sd.copy()
         for of in self.estimation.maps:
-            if first <= of.state < first + len(bodies[pair][1]):
+            if first <= of.state < first + len(self.pairs[pair].later):
                 stiffness[of.elements] *= np.exp(of.log_ratio)
                 sd[of.elements], resolution[of.elements] = of.sd, of.resolution
         return stiffness, sd, resolution
@@ -198,7 +210,11 @@ class CaseResult:
                 _explanation(of, names) for of in (estimation.explanations if estimation.status == "converged" else ())
             ],
             "samples": drawn and drawn.to_dict(),
-            "alignment": [found.row(name) for name, found in zip(names, self.every_alignment, strict=False)],
+            "alignment": [
+                later.alignment.row(name)
+                for name, later in zip(names, (later for pair in self.pairs for later in pair.later), strict=False)
+                if later.alignment is not None
+            ],
             "fit": [
                 {"after": name}
                 | {
@@ -234,8 +250,8 @@ class CaseResult:
             "counts": dict(estimation.counts),
             "mesh": _plain(self.mesh_summary),
         }
-        if self.further:
-            document |= {"pairs": [{"mesh": _plain(pair.mesh_summary)} for pair in self.further]}
+        if self.pairs[1:]:
+            document |= {"pairs": [{"mesh": _plain(pair.mesh_summary)} for pair in self.pairs[1:]]}
         return json_object(document | closing(self.whole_case, provenance, self.all_remarks) | {"note": self.note})
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
@@ -63,41 +64,38 @@ def estimate(
     progress(Line(_in_words(images.pairs), "read"))
     if added is not None:
         added.built_on.refuse_other_images(images.inputs)
-    states, *further = images.pairs
-    cost = expected_cost(case, states.before, states.after, n_pairs=len(images.pairs), mesh=states.mesh)
+    first = images.pairs[0]
+    cost = expected_cost(case, first.before, first.after, n_pairs=len(images.pairs), mesh=first.mesh)
     refuse_lack(cost)
     if condition is not None:
         condition(cost)
     progress(_forecast(cost))
     if case.phantom:
-        stated = [(t.name, t.youngs_modulus_kpa) for t in states.before.tissues if t.role is Role.ESTIMATE]
+        stated = [(t.name, t.youngs_modulus_kpa) for t in first.before.tissues if t.role is Role.ESTIMATE]
         truth = {name: value for name, value in stated if value is not None}
     seconds = time.perf_counter() - began
-    result = estimate_states(
-        states, case, progress=progress, truth=truth, read_seconds=seconds, further=tuple(further), added=added
-    )
+    result = estimate_states(images.pairs, case, progress=progress, truth=truth, read_seconds=seconds, added=added)
     return replace(result, provenance=replace(result.provenance, inputs=images.inputs))
 
 
 @blas_on_one_thread()
 def estimate_states(
-    states: ImagedStates,
+    pairs: Sequence[ImagedStates],
     case: Case,
     *,
     progress: Progress = silent,
     truth: Mapping[str, float] | None = None,
     read_seconds: float = 0.0,
-    further: tuple[ImagedStates, ...] = (),
     added: Added | None = None,
 ) -> CaseResult:
     """The same from states that are already read and aligned; the case gives the settings.
 
-    `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; `further`: pairs of the same
-    body, each with its own reference state, which are meshed on their own and share the moduli; `added`: as above.
+    pairs: of the same body, each with its own reference state, which are meshed on their own and share the moduli;
+    truth: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; added: as above.
     """
     clock, mesh = [time.perf_counter()], added.mesh if added else None
-    bodies = tuple(make_body(pair, case, progress=during("mesh", progress), mesh=mesh) for pair in (states, *further))
-    body, earlier = bodies[0], added.built_on.images if added else 0
+    bodies = tuple(make_body(pair, case, progress=during("mesh", progress), mesh=mesh) for pair in pairs)
+    earlier = added.built_on.images if added else 0
     cost = cost_of_bodies(bodies, case)
     refuse_lack(cost)
     progress(_forecast(cost))
@@ -142,19 +140,14 @@ def estimate_states(
     return CaseResult(
         case,
         estimation,
-        with_ratios(body.space, estimation.found_ratios),
-        _summary(body),
-        states.before,
-        states.after,
+        tuple(_pair_result(body, estimation) for body in bodies),
         Provenance({key: round(float(value), 3) for key, value in seconds.items()}, {}, software_versions()),
         (
             *_remarks(case, *bodies),
             *strain_warnings(case, bodies, estimation),
             *estimate_warnings(case, estimation),
         ),
-        further=_further(bodies, estimation),
         note=added.built_on.sentence(len(problem.states)) if added else "",
-        alignments=states.alignments,
         known=known,
         built_on=added.built_on if added else None,
     )
@@ -234,7 +227,7 @@ def inversion_settings(case: Case, parameters: ParameterMap) -> InversionSetting
 
 def observed_of(inversion: Inversion, bodies: Sequence[Body]) -> Observed:
     """The fitted states of bodies, with the images that they are held against."""
-    images = tuple(image.index if image else None for body in bodies for image in body.states.later)
+    images = tuple(of.image.index if of.image else None for body in bodies for of in body.states.later)
     return Observed(fitted_states(inversion, *bodies), images)
 
 
@@ -242,7 +235,7 @@ def fitted_states(inversion: Inversion, *bodies: Body) -> tuple[FittedState, ...
     """Displacements of the whole meshes at the estimate, with the grids that they were seen on, body after body."""
     objective, unknowns = inversion.objective, inversion.minimum.unknowns
     moduli, coefficients = objective.parameters.moduli(unknowns), objective.parameters.coefficients(unknowns)
-    images = [(b, image or b.states.before) for b in bodies for image in b.states.later]
+    images = [(body, of.image or body.states.before) for body in bodies for of in body.states.later]
     return tuple(
         FittedState(body.space, state.displacement(moduli, q), body.states.before.grid, image.grid)
         for state, q, (body, image) in zip(objective.states, coefficients, images, strict=True)
@@ -253,31 +246,16 @@ def _summary(body: Body) -> MeshSummary:
     return MeshSummary.of(body.quality, body.space, body.edge_length)
 
 
-def _further(bodies: tuple[Body, ...], estimation: Estimation) -> tuple[PairResult, ...]:
-    """The bodies after the first with their displacements."""
-    first = bodies[0].states.n_later
-    found = []
-    for body in bodies[1:]:
-        states = body.states
-        motions = estimation.displacements[first : first + states.n_later]
-        found.append(
-            PairResult(
-                with_ratios(body.space, estimation.found_ratios),
-                _summary(body),
-                states.before,
-                states.after,
-                motions,
-                states.alignments,
-            )
-        )
-        first += states.n_later
-    return tuple(found)
+def _pair_result(body: Body, estimation: Estimation) -> PairResult:
+    """A body as the result has it, with the Poisson's ratios that were found."""
+    states = body.states
+    return PairResult(with_ratios(body.space, estimation.found_ratios), _summary(body), states.before, states.later)
 
 
-def strain_warnings(case: Case, bodies: tuple[Body, ...], estimation: Estimation) -> tuple[Finding, ...]:
+def strain_warnings(case: Case, bodies: Sequence[Body], estimation: Estimation) -> tuple[Finding, ...]:
     """What `linear_strain_warnings` says of the fitted displacements, those of the first body's images first."""
-    motions = iter(estimation.displacements)
-    moved = [(body.space, [next(motions) for _ in body.states.bones]) for body in bodies]
+    left = iter(estimation.displacements)
+    moved = [(body.space, list(islice(left, len(body.states.later)))) for body in bodies]
     return linear_strain_warnings(case.mechanics.material_law, *moved, images=image_names(case))
 
 

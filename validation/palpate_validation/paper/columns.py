@@ -60,7 +60,9 @@ def imaged_states(space: LagrangeSpace, motions: Motions, grid: VoxelGrid) -> Im
 def with_motions(states: ImagedStates, space: LagrangeSpace, motions: Motions) -> ImagedStates:
     """The same rest state with the later states of other u (n_points, 3) mm."""
     before = states.before
-    return replace(states, after=tuple(segment(imaged(space, u, before.grid), before.tissues) for u in motions))
+    images = (segment(imaged(space, u, before.grid), before.tissues) for u in motions)
+    every = zip(states.later, images, strict=True)
+    return replace(states, later=tuple(replace(of, image=image) for of, image in every))
 
 
 def exact_surfaces(
