@@ -5,7 +5,7 @@
 `palpate estimate` and `palpate mesh` of a small case, whose numbers are computed once: only the writing is repeated.
 SIGKILL, SIGTERM, SIGINT and SIGHUP come `--runs` times each, over a whole run, while files are written, and while they
 take their places. Every fsync, mkdir, link, rename and truncation is refused in turn, alone or with all after it; and
-files may not grow beyond `--runs` random sizes. In the place of each file lies a link, a pipe, a socket, a device ...
+files may not grow beyond random sizes. In the place of each file lies a link, a pipe, a socket, a device ...
 
 The folder must hold the old files, or the new ones, or (after SIGKILL, or where even undoing is refused) the old ones
 whole in `earlier-...` and no document. The last words must fit that, in one sentence. The same command must then
@@ -26,7 +26,7 @@ import random
 import resource
 import shutil
 import signal
-import socket
+import stat
 import tempfile
 import time
 from collections import Counter
@@ -42,9 +42,9 @@ from palpate.study import read_case, read_json
 from palpate.study.run import estimate, make_mesh
 
 DOCUMENTS = {"estimate": "result.json", "mesh": "mesh.json"}
-HIDDEN = (".palpate.lock", ".writing-outputs")
-LATE = ("log.txt", "surfaces")  # further places for what is hostile
+HIDDEN = (".palpate.lock", ".writing-outputs", "log.txt")
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+MOST_CHANGES = 60  # of a command
 CHANGES = ((Path, "mkdir"), (Path, "replace"), (os, "link"), (os, "fsync"), (os, "ftruncate"))
 REFUSALS, PATIENCE_S = (2, 3, 6), 60
 CASE = """
@@ -68,12 +68,8 @@ bounds_ratio = [0.5, 4.0]
 """
 
 
-def nothing() -> None:
-    """What is done to most runs."""
-
-
-def arguments(command: str, root: Path, folder: Path) -> list[str]:
-    """The command line."""
+def line(command: str, root: Path, folder: Path) -> list[str]:
+    """The command line of a run."""
     overwrite = ["--overwrite"] if command == "estimate" else []
     return [command, str(root / "case.toml"), "--output", str(folder), "--quiet", *overwrite]
 
@@ -94,140 +90,132 @@ def make(root: Path) -> None:
         estimated, meshed = estimate(case), make_mesh(case)
         run.estimate, run.make_mesh = lambda *_, e=estimated, **__: e, lambda *_, m=meshed, **__: m
         for command in DOCUMENTS:
-            assert palpate([*arguments(command, root, root / place / command), "--set", f"id={who}"]) == 0
+            assert palpate([*line(command, root, root / place / command), "--set", f"id={who}"]) == 0
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """Name -> content of all files that count; of links and pipes the kind."""
+    """Name -> digest of all files that count; of links, pipes and the like the kind."""
     found = {}
-    for path in sorted(folder.rglob("*")) if os.path.lexists(folder) else ():
-        name = path.relative_to(folder).as_posix()
-        hidden = name.split("/")[0] in HIDDEN or name == "log.txt" or name.startswith("earlier-")
-        if not hidden and (path.is_symlink() or not path.is_dir()):
-            plain = path.is_file() and not path.is_symlink()
-            found[name] = hashlib.sha256(path.read_bytes()).hexdigest() if plain else f"{path.lstat().st_mode:o}"
+    for path in folder.rglob("*"):
+        name, kind = path.relative_to(folder).as_posix(), path.lstat().st_mode
+        if not name.startswith((*HIDDEN, "earlier-")) and not stat.S_ISDIR(kind):
+            found[name] = hashlib.sha256(path.read_bytes()).hexdigest() if stat.S_ISREG(kind) else str(kind)
     return found
 
 
-def state(command: str, root: Path, folder: Path, others: dict[str, str]) -> str:
-    """`old`, `new`, `aside` or `mixed`; others: what lies there and is of no run."""
-    old, new, here = contents(root / "old" / command), contents(root / "new" / command), contents(folder)
-    here = {name: of for name, of in here.items() if others.get(name) != of}
-    if here == old:
-        return "old"
-    if DOCUMENTS[command] in here:
-        files = {name: of["sha256"] for name, of in read_json(folder / DOCUMENTS[command])["files"].items()}
-        whole = here.keys() == new.keys() and files == {n: of for n, of in here.items() if n != DOCUMENTS[command]}
-        undone = [name for name in new if new[name] != old.get(name) and here.get(name) == old.get(name)]
-        return "new" if whole and not undone else "mixed"
-    ours = {here[name] == old.get(name) for name in here if new.get(name) != old.get(name)}
-    aside = any(contents(place) == old for place in folder.glob("earlier-*"))
-    return "aside" if aside and len(ours) < 2 else "mixed"
-
-
-def run(command: str, root: Path, folder: Path, prepare: Callable[[], object] = nothing, send: Any = None) -> Any:
-    """Code and words of the command in a process of its own; send: is told its number, once."""
-    with tempfile.TemporaryFile() as words:
-        child = os.fork()
-        if child == 0:
-            for stream in (1, 2):
-                os.dup2(words.fileno(), stream)
-            signal.alarm(PATIENCE_S)
-            code = 99
-            try:
-                prepare()
-                code = palpate(arguments(command, root, folder))
-            finally:
-                os._exit(code)
-        if send is not None:
-            send(child)
-        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        words.seek(0)
-        return code, words.read().decode(errors="replace").strip()
-
-
-def flaw_of(code: int, text: str, found: str) -> str:
-    """What is wrong with the end of a run; empty when nothing is."""
-    if code == 130:
-        wanted, said = ("old",) if "no file was changed" in text else ("new",), text.startswith("palpate: interrupted")
-    elif code in REFUSALS:
-        wanted, said = ("aside",) if "are whole in" in text else ("old",), text.startswith("palpate: ")
-    else:  # a signal before the first line of the command ends it as any program
-        wanted = {0: ("new",), -signal.SIGKILL: ("old", "new", "aside")}.get(code, ("old",) if code < 0 else ())
-        said = True
-    lines = len(text.splitlines())
-    fine = found in wanted and said and (lines == 1 if code > 0 else "bug" not in text and "Traceback" not in text)
-    return "" if fine else f"code {code}, the folder is {found}: {text[-400:]}"
-
-
 class Trials:
-    """Runs that are counted and judged, each in a fresh folder."""
+    """Runs in fresh folders with the other patient's outputs, counted and judged."""
 
     def __init__(self, root: Path) -> None:
         """Those of the case in `root`."""
         self.root, self.folder, self.outside = root, root / "trial" / "out", root / "outside"
+        self.old, self.new = ({of: contents(root / place / of) for of in DOCUMENTS} for place in ("old", "new"))
         self.counts: dict[str, Counter[str]] = {}
         self.failures: list[str] = []
         self.outside.mkdir()
         (self.outside / "file").write_text("mine")
 
-    def judge(self, kind: str, command: str, lay: Callable[[], object] = nothing, **how: Any) -> None:
-        """One run after `lay`."""
+    def judge(self, kind: str, command: str, **how: Any) -> None:
+        """One run; how: see `_run`, and `lay`: what is laid into the folder before."""
+        lay = how.pop("lay", None)
         shutil.rmtree(self.folder, ignore_errors=True)
         shutil.copytree(self.root / "old" / command, self.folder)
-        before, old = contents(self.outside), contents(self.folder)
-        lay()
-        others = {name: of for name, of in contents(self.folder).items() if old.get(name) != of}
-        code, text = run(command, self.root, self.folder, **how)
-        found = state(command, self.root, self.folder, others)
-        if lay is not nothing and code in REFUSALS:
-            found = "old" if others.items() <= contents(self.folder).items() <= (old | others).items() else "mixed"
+        if lay:
+            lay()
+        before, laid = contents(self.outside), contents(self.folder)
+        code, text = self._run(command, **how)
+        found = "old" if lay and contents(self.folder) == laid else self._state(command, laid if lay else {})
         flaw = flaw_of(code, text, found)
-        if lay is nothing and not flaw:  # the same command again
-            again = run(command, self.root, self.folder)
-            now = state(command, self.root, self.folder, {})
-            flaw = "" if (again[0], now) == (0, "new") else f"again: {again}, {now}"
+        if not flaw and not lay:  # the same command again
+            again = self._run(command), self._state(command, {})
+            flaw = "" if again[0][0] == 0 and again[1] == "new" else f"the next run: {again}"
         if contents(self.outside) != before:
             flaw = "something outside was touched"
         self.failures += [f"{command}, {kind}: {flaw}"] if flaw else []
         self.counts.setdefault(kind, Counter()).update(["runs", f"code {code}, {found}"])
 
+    def _run(self, command: str, prepare: Callable[[], object] | None = None, send: Any = None) -> tuple[int, str]:
+        """Code and words of the command in a process of its own, which does `prepare` first; send: gets its number."""
+        with tempfile.TemporaryFile() as words:
+            child = os.fork()
+            if child == 0:
+                for stream in (1, 2):
+                    os.dup2(words.fileno(), stream)
+                signal.alarm(PATIENCE_S)
+                code = 99
+                try:
+                    if prepare:
+                        prepare()
+                    code = palpate(line(command, self.root, self.folder))
+                finally:
+                    os._exit(code)
+            if send:
+                send(child)
+            code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+            words.seek(0)
+            return code, words.read().decode(errors="replace").strip()
+
+    def _state(self, command: str, laid: dict[str, str]) -> str:
+        """`old`, `new`, `aside` or `mixed`; laid: what lay in the folder, and is of no run where it is not old."""
+        old, new, document = self.old[command], self.new[command], DOCUMENTS[command]
+        here = {name: of for name, of in contents(self.folder).items() if laid.get(name, old.get(name)) != of}
+        kept = {name: of for name, of in contents(self.folder).items() if old.get(name) == of}
+        if kept == old and not here:
+            return "old"
+        both = {**kept, **here}
+        differ = [name for name in kept if new.get(name) != kept[name]]
+        if document in here:
+            files = {name: of["sha256"] for name, of in read_json(self.folder / document)["files"].items()}
+            told = both.keys() == new.keys() and files == {name: of for name, of in both.items() if name != document}
+            return "new" if told and not differ else "mixed"
+        aside = any(contents(place) == old for place in self.folder.glob("earlier-*"))
+        return "aside" if aside and not (differ and here) and document not in both else "mixed"
+
+
+def flaw_of(code: int, text: str, found: str) -> str:
+    """What is wrong with the end of a run; empty when nothing is."""
+    if code == 130:
+        wanted = {"old"} if "no file was changed" in text else {"new"}
+    elif code in REFUSALS:
+        wanted = {"aside"} if "are whole in" in text else {"old"}
+    else:  # a signal before the first line of the command ends it as any program
+        wanted = {0: {"new"}, -signal.SIGKILL: {"old", "new", "aside"}}.get(code, {"old"} if code < 0 else set())
+    plain = text.startswith("palpate: ") and "\n" not in text if code > 0 else "Traceback" not in text
+    return "" if found in wanted and plain and "bug" not in text else f"code {code}, {found}: {text[-400:]}"
+
 
 def signals(trials: Trials, runs: int, rng: random.Random) -> None:
     """Each signal over a whole run, while files are written, and while they take their places."""
     for command, kind, turn in itertools.product(DOCUMENTS, SIGNALS, range(runs)):
-        moment = ("any", ".writing-outputs", "earlier-*")[turn % 3]
+        moment, longest = ((".", 1.0), (".writing-outputs", 0.1), ("earlier-*", 0.002))[turn % 3]
 
-        def send(child: int, moment: str = moment, kind: signal.Signals = kind) -> None:
+        def send(child: int, kind: signal.Signals = kind, moment: str = moment, longest: float = longest) -> None:
             """Wait for the moment."""
-            overdue = time.monotonic() + (rng.random() if moment == "any" else 2.0)
-            while time.monotonic() < overdue and (moment == "any" or not list(trials.folder.glob(moment))):
-                time.sleep(0.0)
-            time.sleep(0.0 if moment == "any" else rng.random() ** 2 * (0.1 if moment.startswith(".") else 0.002))
+            overdue = time.monotonic() + 2.0
+            while moment != "." and time.monotonic() < overdue and not any(trials.folder.glob(moment)):
+                pass
+            time.sleep(longest * rng.random())
             os.kill(child, kind)
 
-        trials.judge(f"{kind.name}, {moment}", command, send=send)
+        trials.judge(f"{kind.name}, from {moment}", command, send=send)
 
 
-def refused(turn: int, folder: Path, *, alone: bool) -> None:
-    """From here on the change of that number below the folder fails, alone or with all after it."""
+def refused(turn: int, *, alone: bool) -> None:
+    """From here on the change of that number fails, alone or with all after it."""
     count = itertools.count()
 
     def wrapped(function: Callable[..., Any]) -> Callable[..., Any]:
         """The function, refused in its turn."""
 
-        def call(place: Any, *rest: Any, **options: Any) -> Any:
+        def call(*given: Any, **options: Any) -> Any:
             """Refuse or do it."""
-            path = str(Path(f"/proc/self/fd/{place}").readlink()) if isinstance(place, int) else str(place)
-            number = next(count) if path.startswith(str(folder)) else -1
+            number = next(count)
             if number == turn or (number > turn and not alone):
-                (folder.parent / "refused").touch()
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            return function(place, *rest, **options)
+            return function(*given, **options)
 
         return call
 
-    (folder.parent / "refused").unlink(missing_ok=True)
     for place, name in CHANGES:
         setattr(place, name, wrapped(getattr(place, name)))
 
@@ -240,20 +228,11 @@ def no_larger(size: int) -> None:
 
 def full_disks(trials: Trials, runs: int, rng: random.Random) -> None:
     """Each change refused; files of limited sizes."""
-    for command, alone in itertools.product(DOCUMENTS, (True, False)):
-        for turn in itertools.count():
-            prepare = functools.partial(refused, turn, trials.folder, alone=alone)
-            trials.judge(f"refused {'alone' if alone else 'with all after it'}", command, prepare=prepare)
-            if not (trials.folder.parent / "refused").exists():
-                break
+    for command, alone, turn in itertools.product(DOCUMENTS, (True, False), range(MOST_CHANGES)):
+        kind = f"change refused{'' if alone else ' with all after it'}"
+        trials.judge(kind, command, prepare=functools.partial(refused, turn, alone=alone))
     for command, _ in itertools.product(DOCUMENTS, range(runs)):
         trials.judge("files too large", command, prepare=functools.partial(no_larger, int(10 ** rng.uniform(1, 5.5))))
-
-
-def a_socket(place: Path) -> None:
-    """A socket's file."""
-    with socket.socket(socket.AF_UNIX) as server:
-        server.bind(str(place))
 
 
 def hostile(trials: Trials) -> None:
@@ -265,23 +244,23 @@ def hostile(trials: Trials) -> None:
         "link to itself": lambda place: place.symlink_to(place.name),
         "hard link": lambda place: place.hardlink_to(trials.outside / "file"),
         "pipe": os.mkfifo,
-        "socket": a_socket,
+        "socket": lambda place: os.mknod(place, 0o666 | stat.S_IFSOCK),
         "folder": lambda place: (place / "deep").mkdir(parents=True),
     }
     if os.getuid() == 0:
-        kinds["device"] = lambda place: os.mknod(place, 0o020666, os.makedev(1, 7))  # /dev/full
-    for command, (kind, make_one) in itertools.product(DOCUMENTS, kinds.items()):
-        for name in {*contents(trials.root / "new" / command), *HIDDEN, *LATE}:
+        kinds["device"] = lambda place: os.mknod(place, 0o666 | stat.S_IFCHR, os.makedev(1, 7))  # /dev/full
+    for command, (kind, one) in itertools.product(DOCUMENTS, kinds.items()):
+        for name in sorted({*trials.new[command], *HIDDEN, "surfaces"}):
 
-            def lay(place: Path = trials.folder / name, make_one: Callable[[Path], object] = make_one) -> None:
-                """Put it in the place of what lies there."""
+            def lay(place: Path = trials.folder / name, one: Callable[[Path], object] = one) -> None:
+                """Put one in the place of what lies there."""
                 if place.is_dir():
                     shutil.rmtree(place)
                 place.unlink(missing_ok=True)
                 place.parent.mkdir(exist_ok=True)
-                make_one(place)
+                one(place)
 
-            trials.judge(kind, command, lay)
+            trials.judge(kind, command, lay=lay)
 
 
 def main() -> None:

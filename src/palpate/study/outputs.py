@@ -32,18 +32,8 @@ SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP"
 RESULT, PAGE, DATA = "result.json", "report.html", "report-data.npz"  # the document of an estimate, and its report
 DOCUMENTS = (RESULT, "mesh.json", "simulation.json", "sensitivity.json")  # each lists the files of its run
 KNOWN_IMAGES = "known-images.npz"  # what its images tell, for others that are added
-RESULT_FILES = (  # what else an estimate writes, with its case
-    DATA,
-    PAGE,
-    KNOWN_IMAGES,
-    "labels.csv",
-    "labels.nii.gz",
-    "mesh.vtu",
-    "model.npz",
-    "posterior.nc",
-    "stiffness.nii.gz",
-    "stiffness_sd.nii.gz",
-)
+MAPS = ("stiffness.nii.gz", "stiffness_sd.nii.gz")
+RESULT_FILES = (DATA, PAGE, KNOWN_IMAGES, *MAPS, "labels.csv", "labels.nii.gz", "mesh.vtu", "model.npz", "posterior.nc")
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +139,7 @@ class OutputFolder:
     def _exchange(self, area: Path, names: Sequence[str], retired: Iterable[str], before: Iterable[str]) -> None:
         """Let the files of the area take their places and those `retired` leave; before: all of the earlier run."""
         leaving = [name for name in (*retired, *names) if (self.path / name).exists()]
-        aside = self.path / f"{EARLIER}{secrets.token_hex(4)}"
+        aside, moved = self.path / f"{EARLIER}{secrets.token_hex(4)}", list[str]()
         try:
             for name in dict.fromkeys([*leaving, *before]):
                 _name_twice(self.path / name, aside / name)
@@ -164,17 +154,18 @@ class OutputFolder:
             for name in names:  # documents last
                 if name in DOCUMENTS:
                     _sync(*{(self.path / other).parent for other in names})
+                moved.append(name)
                 _move(area / name, self.path / name)
             _sync(*{(self.path / name).parent for name in names})
         except BaseException as error:
-            self._put_back(names, aside, error)
+            self._put_back(aside, moved, error)
             raise
         shutil.rmtree(aside, ignore_errors=True)
 
-    def _put_back(self, names: Iterable[str], aside: Path, cause: BaseException) -> None:
-        """Undo an exchange that was broken off."""
+    def _put_back(self, aside: Path, moved: Iterable[str], cause: BaseException) -> None:
+        """Undo an exchange that was broken off; moved: names of new files that may be in their places."""
         try:
-            for name in names:
+            for name in moved:
                 (self.path / name).unlink(missing_ok=True)
             for name in files_in(aside):
                 if not (self.path / name).exists():
@@ -253,7 +244,7 @@ def vouched(folder: Path, document: str) -> set[str]:
     Or of one whose files a killed run has left in a folder `earlier-...`.
     """
     told = [of for place in (folder, *folder.glob(f"{EARLIER}*")) for of in listed(place, document).items()]
-    return {name for name, sha256 in told if has_digest(folder / name, sha256)}
+    return {name for name, sha256 in told if is_inside(folder, name) and has_digest(folder / name, sha256)}
 
 
 def has_digest(path: Path, sha256: str | None) -> bool:
