@@ -114,9 +114,10 @@ def test_what_a_kill_leaves_is_told_and_does_not_stop_the_next_run(estimate, out
     before, remove = contents(out), os.unlink
 
     def work() -> int:
-        Path.unlink = lambda path, **_: (
-            os.kill(os.getpid(), signal.SIGKILL) if path.name == "mesh.vtu" else remove(path)
-        )
+        def unlink(path, **_):
+            return os.kill(os.getpid(), signal.SIGKILL) if path.name == "mesh.vtu" else remove(path)
+
+        Path.unlink = unlink
         return estimate("bert", "--quiet")
 
     assert in_a_child(work) == -signal.SIGKILL

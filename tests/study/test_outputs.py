@@ -7,6 +7,7 @@ import itertools
 import os
 import signal
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -100,7 +101,7 @@ def test_a_kill_leaves_the_old_files_or_the_new_ones_or_the_old_ones_aside(tmp_p
     while code == -signal.SIGKILL:
         folder, turn = tmp_path / str(len(seen)), len(seen)
         lay(folder, "old")
-        code = in_a_child(lambda: changed_but(folder, turn, kill))
+        code = in_a_child(partial(changed_but, folder, turn, kill))
         seen.append(state(folder, whole))
         replace(folder)
         assert state(folder, whole) == "new", "the next run in the folder"
@@ -116,7 +117,7 @@ def test_a_full_disk_leaves_the_old_files_in_their_places_or_aside_or_makes_no_d
         turn += 1
         folder = tmp_path / str(turn)
         lay(folder, "old")
-        code = in_a_child(lambda: changed_but(folder, turn, no_space, only=only))
+        code = in_a_child(partial(changed_but, folder, turn, no_space, only=only))
         seen.add((code, state(folder, whole)))
     undone, done = {(6, "old")}, {(0, "new"), (NO_SUCH_TURN, "new")}
     assert undone < seen <= undone | done | (set() if only else {(6, "aside")})
