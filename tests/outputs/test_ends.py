@@ -62,8 +62,13 @@ def script(text: str, **words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False, env=threads)
 
 
-@pytest.mark.parametrize("signal", SIGNALS)
-@pytest.mark.parametrize("module", ["argparse", "palpate.cli.console", "numpy", "palpate.study.check"])
+@pytest.mark.parametrize(
+    ("module", "signal"),
+    [
+        *((module, name) for module in ("argparse", "palpate.cli.console", "numpy") for name in SIGNALS),
+        ("palpate.study.check", "SIGHUP"),  # as late, after many others
+    ],
+)
 def test_a_signal_while_modules_are_imported_ends_with_130_and_a_sentence(module, signal):
     done = script(IMPORTS, module=module, signal=signal)
     assert (done.returncode, done.stdout) == (130, ""), done.stderr
