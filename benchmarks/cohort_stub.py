@@ -26,7 +26,7 @@ from palpate.cohort.progress import status_of
 from palpate.cohort.run import Options, run_cohort
 from palpate.cohort.table import read_table
 from palpate.cohort.task import Row
-from palpate.study import held_folder
+from palpate.study import OutputFolder
 
 WORK = "cohort_stub_work:stub"
 
@@ -34,7 +34,7 @@ WORK = "cohort_stub_work:stub"
 def run(table: Path, output: Path, *, engine: Engine, resume: bool) -> int:
     """The command with stub work."""
     rows = read_table(table, table.with_name("template.toml"))
-    with held_folder(output):
+    with OutputFolder(output).held():
         records = run_cohort(rows, output, engine, Options(resume=resume), progress=lambda _: None)
     return 0 if all(record.state == "done" for record in records) else 6
 

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from palpate.cohort.task import Outcome, Task
 from palpate.errors import GeometryError
-from palpate.study.lock import held_folder
-from palpate.study.outputs import RESULT, sha256_of, staged, write_json
+from palpate.study.outputs import RESULT, OutputFolder, sha256_of, write_json
 
 
 def work(task: Task, tell) -> Outcome:
@@ -49,10 +48,10 @@ def work(task: Task, tell) -> Outcome:
         "verdict": "identified",
         "interval95": [25.0, 44.0],
     }
-    with held_folder(folder), staged(folder) as staging:
-        write_json(staging.area / RESULT, {"id": task.row.id, "estimates": [item]})
-        digest = sha256_of(staging.area / RESULT)
+    outputs = OutputFolder(folder)
+    with outputs.held(), outputs.new_files() as area:
+        write_json(area / RESULT, {"id": task.row.id, "estimates": [item]})
+        digest = sha256_of(area / RESULT)
         outcome = Outcome(task.row.id, "done", key, message="; ".join(task.remarks), result=digest)
-        write_json(staging.area / "done.json", {"schema": "palpate.done/1"} | outcome.to_dict())
-        staging.commit()
+        write_json(area / "done.json", {"schema": "palpate.done/1"} | outcome.to_dict())
     return outcome

@@ -71,7 +71,7 @@ def test_settings_that_cannot_be_leave_nothing(folder, tmp_path, options, said):
 
 def test_figures_do_not_go_into_the_result(folder):
     before = sorted(folder.iterdir())
-    with pytest.raises(ConfigurationError, match="choose another one"):
+    with pytest.raises(ConfigurationError, match="which stays alone"):
         palpate.figures(folder, folder)
     assert sorted(folder.iterdir()) == before
 

@@ -1,4 +1,4 @@
-"""Outputs take their places all together or not at all, whatever happens in between."""
+"""New files take their places together or not at all, and none that was there before is lost, whatever happens."""
 
 from __future__ import annotations
 
@@ -7,41 +7,64 @@ import itertools
 import os
 import signal
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from children import in_a_child
 from palpate.errors import ResourceError
-from palpate.study.outputs import STAGING, make_folder, recover, staged, write_json, write_text
+from palpate.study.outputs import AREA, EARLIER, OutputFolder, make_folder, sha256_of, write_json
 
-OLD = {"result.json": "old", "mesh.vtu": "old", "sub/a": "old", "page": "old", "page.earlier": "older", "mine": "mine"}
+NAMES = {"old": ("mesh.vtu", "report.html", "surfaces/a"), "new": ("mesh.vtu", "report.html", "surfaces/b")}
+CHANGES = ((Path, "replace"), (Path, "unlink"), (os, "link"), (os, "fsync"), (os, "rmdir"))  # of names, and to the disk
 NO_SUCH_TURN = 98
-NEW = {"result.json": "new", "mesh.vtu": "new", "sub/b": "new", "page.earlier": "old", "mine": "mine"}
 
 
-def put(folder: Path, content: dict[str, str]) -> None:
-    for name, text in content.items():
+def lay(folder: Path, run: str) -> None:
+    """The files of a run, and the document that lists them."""
+    for name in NAMES[run]:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text)
-
-
-def content(folder: Path) -> dict[str, str]:
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    return {path.relative_to(folder).as_posix(): path.read_text() for path in files}
+        (folder / name).write_text(run)
+    files = {name: {"sha256": sha256_of(folder / name)} for name in NAMES[run]}
+    write_json(folder / "result.json", {"run": run, "files": files})
 
 
 def replace(folder: Path) -> None:
-    with staged(folder) as staging:
-        put(staging.area, dict.fromkeys(("result.json", "mesh.vtu", "sub/b"), "new"))
-        staging.commit(retired=["sub/a"], aside=["page"])
+    with OutputFolder(folder).new_files() as area:
+        lay(area, "new")
 
 
-def replace_but(folder: Path, turn: int, fail: Callable[[], None], *, only: bool = True) -> int:
-    """Replace the files; the operation of that number (from 0) that changes names fails, or it and all after it.
+def content(folder: Path) -> dict[str, str]:
+    names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+    return {name: (folder / name).read_text() for name in names if not name.startswith((AREA, EARLIER))}
 
-    Gives the exit code of what came of it, `NO_SUCH_TURN` where there are fewer operations.
-    """
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> dict[str, dict[str, str]]:
+    """What a folder holds with the files of one run, and with nothing else."""
+    found = {}
+    for run in NAMES:
+        folder = tmp_path_factory.mktemp(run)
+        lay(folder, run)
+        found[run] = content(folder)
+    return found
+
+
+def state(folder: Path, whole: dict[str, dict[str, str]]) -> str:
+    """Whose files are in the folder: `old`, `new`, or `aside`: the old ones are whole in a folder of their own."""
+    here = content(folder)
+    for run, files in whole.items():
+        if here == files:
+            return run
+    assert "result.json" not in here, "a document tells of files that are not beside it"
+    assert len(set(here.values())) <= 1, "files of two runs are mixed"
+    assert [content(aside) for aside in folder.glob(f"{EARLIER}*")] == [whole["old"]]
+    return "aside"
+
+
+def changed_but(folder: Path, turn: int, fail: Callable[[], None], work=replace, *, only: bool = True) -> int:
+    """The exit code of `work` in the folder, where the change of that number fails, or it and all after it."""
     count = itertools.count()
 
     def wrapped(function):
@@ -53,10 +76,10 @@ def replace_but(folder: Path, turn: int, fail: Callable[[], None], *, only: bool
 
         return call
 
-    for place, name in ((Path, "replace"), (Path, "unlink"), (os, "fsync")):
+    for place, name in CHANGES:
         setattr(place, name, wrapped(getattr(place, name)))  # for this process, which ends soon
     try:
-        replace(folder)
+        work(folder)
     except ResourceError as error:
         return error.exit_code
     return 0 if next(count) > turn else NO_SUCH_TURN
@@ -66,111 +89,76 @@ def kill() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def fill() -> None:
+def no_space(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_files_take_their_places_together(tmp_path):
-    put(tmp_path, OLD)
-    replace(tmp_path)
-    assert content(tmp_path) == NEW
-
-
-def test_a_kill_at_any_operation_leaves_what_the_next_run_makes_whole(tmp_path):
+@pytest.mark.parametrize("links", [True, False])
+def test_a_kill_leaves_the_old_files_or_the_new_ones_or_the_old_ones_aside(tmp_path, whole, monkeypatch, links):
+    if not links:
+        monkeypatch.setattr(os, "link", no_space)  # as a file system that has none
     seen, code = [], -signal.SIGKILL
     while code == -signal.SIGKILL:
-        turn = len(seen)
-        folder = tmp_path / str(turn)
-        put(folder, OLD)
-        code = in_a_child(lambda folder=folder, turn=turn: replace_but(folder, turn, kill))
-        visible = {name: text for name, text in content(folder).items() if not name.startswith(STAGING)}
-        assert visible.get("result.json") is None or visible in (OLD, NEW)  # where the document is, its files are
-        assert not {"old", "new"} <= {visible.get(name) for name in ("mesh.vtu", "sub/a", "sub/b")}
-        recover(folder)
-        assert content(folder) in (OLD, NEW), turn
-        seen.append(content(folder) == NEW)
+        folder, turn = tmp_path / str(len(seen)), len(seen)
+        lay(folder, "old")
+        code = in_a_child(partial(changed_but, folder, turn, kill))
+        seen.append(state(folder, whole))
+        replace(folder)
+        assert state(folder, whole) == "new", "the next run in the folder"
+        assert not (folder / AREA).exists()
     assert code == NO_SUCH_TURN
-    assert not seen[0]
-    assert seen[-1]
-    assert sorted(seen) == seen  # once it is decided, it stays decided
-    assert len(seen) > 15
+    assert [run for run, _ in itertools.groupby(seen)] == ["old", "aside", "new"]
 
 
 @pytest.mark.parametrize("only", [True, False])
-def test_a_refused_operation_leaves_the_old_files_or_the_new_ones(tmp_path, only):
-    turn, code = -1, 0
+def test_a_full_disk_leaves_the_old_files_in_their_places_or_aside_or_makes_no_difference(tmp_path, whole, only):
+    turn, code, seen = -1, 0, set()
     while code != NO_SUCH_TURN:
         turn += 1
         folder = tmp_path / str(turn)
-        put(folder, OLD)
-        code = in_a_child(lambda folder=folder, turn=turn: replace_but(folder, turn, fill, only=only))
-        assert code in (0, ResourceError.exit_code, NO_SUCH_TURN)
-        done = code != ResourceError.exit_code
-        if not (folder / STAGING).exists():
-            assert content(folder) == (NEW if done else OLD), turn
-        recover(folder)
-        assert content(folder) in (OLD, NEW), turn
-        assert not done or content(folder) == NEW
-    assert turn > 15
+        lay(folder, "old")
+        code = in_a_child(partial(changed_but, folder, turn, no_space, only=only))
+        seen.add((code, state(folder, whole)))
+    undone, done = {(6, "old")}, {(0, "new"), (NO_SUCH_TURN, "new")}
+    assert undone < seen <= undone | done | (set() if only else {(6, "aside")})
 
 
-def test_an_interrupt_waits_until_the_files_have_their_places(tmp_path):
-    put(tmp_path, OLD)
-
-    def interrupted() -> int:
-        first = Path.replace
-
-        def call(path, target):
-            signal.raise_signal(signal.SIGINT)
-            return first(path, target)
-
-        Path.replace = call
-        try:
-            replace(tmp_path)
-        except KeyboardInterrupt:
-            return 130
-        return 0
-
-    assert in_a_child(interrupted) == 130
-    assert content(tmp_path) == NEW
+def test_an_interrupt_waits_until_all_files_have_their_places(tmp_path, whole, monkeypatch):
+    lay(tmp_path, "old")
+    first = Path.unlink
+    monkeypatch.setattr(Path, "unlink", lambda *a, **o: (signal.raise_signal(signal.SIGINT), first(*a, **o)))
+    with pytest.raises(KeyboardInterrupt):
+        replace(tmp_path)
+    assert state(tmp_path, whole) == "new"
 
 
-def test_what_is_not_committed_is_gone(tmp_path):
-    put(tmp_path, OLD)
-    with staged(tmp_path) as staging:
-        write_text(staging.area / "result.json", "half")
-    assert content(tmp_path) == OLD
-    assert not (tmp_path / STAGING).exists()
+def test_a_file_that_comes_alone_is_there_at_any_moment(tmp_path):
+    def replace_plan(folder: Path) -> None:
+        with OutputFolder(folder).new_files() as area:
+            (area / "plan.json").write_text("new")
+
+    seen, code = [], -signal.SIGKILL
+    while code == -signal.SIGKILL:
+        (tmp_path / "plan.json").write_text("old")
+        code = in_a_child(lambda: changed_but(tmp_path, len(seen), kill, replace_plan))
+        seen.append((tmp_path / "plan.json").read_text())
+    assert [run for run, _ in itertools.groupby(seen)] == ["old", "new"]
 
 
-@pytest.mark.parametrize("part", ["ready", "old"])
-def test_a_hidden_folder_made_by_others_moves_nothing_into_or_out_of_the_folder(tmp_path, part):
-    out, other = tmp_path / "out", tmp_path / "other"
-    put(other, {"mine": "mine"})
-    (out / STAGING).mkdir(parents=True)
-    (out / STAGING / part).symlink_to(other)
-    with pytest.raises(ResourceError, match="no folder of Palpate's"):
-        recover(out)
-    (out / STAGING / part).unlink()
-    put(out / STAGING / part, {"sub/taken": "planted"})
-    (out / "sub").symlink_to(other)
-    with pytest.raises(ResourceError, match="leads out of the folder through a link"):
-        recover(out)
-    (out / "sub").unlink()
-    (out / STAGING / part / "link").symlink_to(other / "mine")
-    recover(out)
-    assert content(out) == {"sub/taken": "planted"}
-    assert content(other) == {"mine": "mine"}
+def test_files_of_a_block_that_is_left_early_are_gone(tmp_path, whole):
+    lay(tmp_path, "old")
 
-
-def test_a_full_disk_is_a_resource_error(tmp_path):
-    def fill():
-        with staged(tmp_path):
-            raise OSError(28, "No space left on device")
+    def broken_off(error: Exception) -> None:
+        with OutputFolder(tmp_path).new_files() as area:
+            lay(area, "new")
+            raise error
 
     with pytest.raises(ResourceError, match="No space left on device; free some space"):
-        fill()
-    assert list(tmp_path.iterdir()) == []
+        broken_off(OSError(errno.ENOSPC, "No space left on device"))
+    with pytest.raises(ZeroDivisionError):
+        broken_off(ZeroDivisionError())
+    assert state(tmp_path, whole) == "old"
+    assert not (tmp_path / AREA).exists()
 
 
 def test_a_folder_that_cannot_be_made_is_a_resource_error(tmp_path):

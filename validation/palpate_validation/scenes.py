@@ -22,7 +22,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from palpate.errors import ResourceError
 from palpate.parallel import processors
 from palpate.progress import Line
-from palpate.study import make_folder, own_file, software_versions, staged, write_json
+from palpate.study import OutputFolder, make_folder, own_file, software_versions, write_json
 
 __all__ = ["Found", "Job", "Ledger", "Part", "Progress", "Scenes", "compute"]
 
@@ -88,10 +88,11 @@ class Scenes(Generic[FoundT]):
         parts = f"{self.name}.parts.jsonl"
         made_under = sha256(repr((self.settings, software_versions())).encode()).hexdigest()[:16]
         result = self.found(Ledger(folder / parts, made_under), progress=progress, workers=workers)
-        with staged(folder) as new:
-            write_json(new.area / f"{self.name}.json", result.to_dict())
-            self.draw(result, new.area / f"{self.name}{self.ending}")
-            new.commit(retired=[parts] if self.again else [])
+        with OutputFolder(folder).new_files() as area:
+            write_json(area / f"{self.name}.json", result.to_dict())
+            self.draw(result, area / f"{self.name}{self.ending}")
+        if self.again:
+            (folder / parts).unlink(missing_ok=True)
         return result
 
 

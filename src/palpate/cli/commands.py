@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from palpate.cli.outcome import Outcome, columns, listed
-from palpate.errors import ConfigurationError
 from palpate.progress import Line, Progress
 from palpate.steps.streams import tell
 from palpate.steps.warning_lines import warning_lines
@@ -90,10 +89,9 @@ def voxelise(arguments: argparse.Namespace, _: None, outputs: OutputFolder, prog
         progress=progress,
     )
     document = found.to_dict()
-    with outputs.staged() as staging:
-        write_label_image(staging.area / "surfaces.nii.gz", found.image)
-        write_json(staging.area / "labels.json", {"labels": document["labels"]})
-        staging.commit()
+    with outputs.new_files() as area:
+        write_label_image(area / "surfaces.nii.gz", found.image)
+        write_json(area / "labels.json", {"labels": document["labels"]})
     rows = [["label", "organ", "volume of the surface, mL", "of its voxels, mL"]]
     for label, name in found.image.names.items():
         rows.append([str(label), name, *(f"{volume / 1000.0:.4g}" for volume in found.volumes_mm3[name])])
@@ -103,7 +101,7 @@ def voxelise(arguments: argparse.Namespace, _: None, outputs: OutputFolder, prog
 def mesh(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Make a mesh and write it."""
     from palpate.export.case_files import write_mesh_files
-    from palpate.steps.saving import save_document
+    from palpate.steps.saving import write_document
     from palpate.study.earlier import refuse_other_result
     from palpate.study.run import make_mesh
 
@@ -111,9 +109,9 @@ def mesh(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Pro
     result = make_mesh(case, progress=progress)
     progress(Line("writing the mesh"))
     document = result.to_dict()
-    with outputs.staged() as staging:
-        write_mesh_files(result, staging.area)
-        save_document(staging, "mesh.json", document)
+    with outputs.new_files() as area:
+        write_mesh_files(result, area)
+        write_document(document, "mesh.json", outputs, area)
     summary = result.mesh_summary
     text = (
         f"{summary.nodes} nodes, {summary.tets} tetrahedra, {summary.dofs} unknowns; dihedral angles: smallest"
@@ -125,7 +123,7 @@ def mesh(_: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Pro
 def simulate(arguments: argparse.Namespace, case: Case, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Simulate a later state and write it."""
     from palpate.export.case_files import write_simulation_files
-    from palpate.steps.saving import save_document
+    from palpate.steps.saving import write_document
     from palpate.study.earlier import refuse_other_result
     from palpate.study.simulate import simulate as simulated
 
@@ -133,9 +131,9 @@ def simulate(arguments: argparse.Namespace, case: Case, outputs: OutputFolder, p
     result = simulated(case, steps=arguments.steps, progress=progress)
     progress(Line("writing the simulated state"))
     document = result.to_dict()
-    with outputs.staged() as staging:
-        write_simulation_files(result, staging.area)
-        save_document(staging, "simulation.json", document)
+    with outputs.new_files() as area:
+        write_simulation_files(result, area)
+        write_document(document, "simulation.json", outputs, area)
     moved = f"the largest displacement is {document['largest_displacement_mm']:.2f} mm"
     return Outcome(document, f"{moved}\n{warning_lines(document)}{listed(outputs)}")
 
@@ -146,8 +144,6 @@ def export(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progre
     from palpate.export.formats import Options
     from palpate.export.model_file import read_model
 
-    if outputs.same_files([""], [arguments.result]):
-        raise ConfigurationError(f"{outputs.path} is the folder of the result itself: choose another --output")
     progress(Line("reading the result"))
     model = read_model(arguments.result)
     progress(Line(f"writing the files for {arguments.format}"))
@@ -162,8 +158,6 @@ def figures(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progr
 
     formats = tuple(dict.fromkeys(arguments.formats.split(",")))
     refuse_settings(formats, arguments.dpi)
-    if outputs.same_files([""], [arguments.result]):
-        raise ConfigurationError(f"{outputs.path} is the folder of the result itself: choose another --output")
     progress(Line("reading the result"))
     data = read_data(arguments.result)
     drawn = figures_into(outputs, data, formats=formats, unit=arguments.unit, dpi=arguments.dpi, progress=progress)

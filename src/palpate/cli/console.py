@@ -21,7 +21,7 @@ from typing import TextIO
 
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.steps.streams import LOGGER, give_up, tell
-from palpate.study.lock import held_folder, own_file
+from palpate.study.lock import own_file
 from palpate.study.outputs import OutputFolder
 
 LOGGER.addHandler(logging.NullHandler())  # before there is a log file, messages reach the user as sentences only
@@ -45,7 +45,7 @@ def output_folder(outputs: OutputFolder, heading: str, *, logs: bool) -> Iterato
     A case or an input that is refused leaves the folder as it was, log and all: its sentence says everything.
     """
     folder = outputs.path
-    with held_folder(folder) as locked, _logged(folder / "log.txt", heading) if logs else nullcontext():
+    with outputs.held() as locked, _logged(folder / "log.txt", heading) if logs else nullcontext():
         if not locked and sys.platform != "win32":
             LOGGER.warning(UNLOCKED, folder)
             tell(f"palpate: warning: {UNLOCKED % folder}", sys.stderr)

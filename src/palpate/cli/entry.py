@@ -155,18 +155,27 @@ def _spare_inputs(arguments: argparse.Namespace, case: Case | None, outputs: Out
         images = case.images
         inputs += [images.before, *images.after, images.names, images.intensities_before, *images.intensities_after]
         inputs += [path for pair in case.pairs for path in (pair.before, *pair.after)]
-    names = outputs.same_files(arguments.targets, [path for path in inputs if path is not None])
-    if names:
-        raise ConfigurationError(
-            f"{outputs.path / names[0]} is an input of this run, and would be replaced by its output of that name:"
-            " choose another --output folder"
-        )
-    masks = [path for path in inputs if path is not None and outputs.same_files([""], [path])]
-    if masks and any(name.endswith((".nii", ".nii.gz")) for name in arguments.targets):
+    for path in (outputs.path / name for name in arguments.targets):
+        if _is_one_of(path, inputs):
+            raise ConfigurationError(
+                f"{path} is an input of this run, and would be replaced by its output of that name: choose another"
+                " --output folder"
+            )
+    writes_images = any(name.endswith((".nii", ".nii.gz")) for name in arguments.targets)
+    if writes_images and _is_one_of(outputs.path, inputs):
         raise ConfigurationError(
             f"{outputs.path} is an input of this run, a folder of masks, in which an image would be taken for one more"
             " mask: choose another --output folder"
         )
+
+
+def _is_one_of(path: Path, files: Sequence[Path | None]) -> bool:
+    """Whether a path leads to one of the files, of which some may not exist."""
+    for file in files:
+        with suppress(OSError, ValueError):
+            if file is not None and path.samefile(file):
+                return True
+    return False
 
 
 def _failure(kind: str, message: str, exit_code: int) -> Outcome:

@@ -9,7 +9,7 @@ from palpate.cli.outcome import Outcome, columns, estimates_table, listed
 from palpate.errors import ConfigurationError, EstimationError
 from palpate.progress import Line, Progress
 from palpate.steps.warning_lines import warning_lines
-from palpate.study.outputs import ASIDE, DATA, PAGE, RESULT, RESULT_FILES
+from palpate.study.outputs import PAGE, RESULT, RESULT_FILES
 
 if TYPE_CHECKING:
     from palpate.study.case import Case
@@ -17,9 +17,8 @@ if TYPE_CHECKING:
     from palpate.study.result import CaseResult
 
 
-SET_ASIDE = tuple(f"{name}{ASIDE}" for name in (PAGE, DATA))
 SENSITIVITY_TARGETS = ("sensitivity.json", "sensitivity.html")
-TARGETS = (RESULT, *RESULT_FILES, *SET_ASIDE, "case.toml")
+TARGETS = (RESULT, *RESULT_FILES, "case.toml")
 
 
 def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder, progress: Progress) -> Outcome:
@@ -99,7 +98,7 @@ def report(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: P
 
 
 def _write_estimate(result: CaseResult, outputs: OutputFolder, progress: Progress) -> Outcome:
-    """Put all outputs of an estimate in place, or all but the page where that cannot be made."""
+    """Put all outputs of an estimate in place."""
     from palpate.steps.saving import save_estimate
 
     document = save_estimate(result, outputs, progress=progress)

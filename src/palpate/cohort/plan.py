@@ -15,8 +15,7 @@ from palpate.cohort.task import FAILURE_CLASSES, Limits, Outcome, Row, Task
 from palpate.errors import FolderInUse, InputDataError, ResourceError
 from palpate.images.input_file import like
 from palpate.parallel import mapped
-from palpate.study.lock import held_folder
-from palpate.study.outputs import RESULT, read_json, sha256_of, staged, write_json
+from palpate.study.outputs import RESULT, OutputFolder, read_json, sha256_of, write_json
 
 MARK = "done.json"
 DONE_SCHEMA = "palpate.done/1"
@@ -33,9 +32,8 @@ def write_mark(folder: Path, outcome: Outcome) -> Outcome:
     """
     result = folder / RESULT
     outcome = replace(outcome, result=sha256_of(result) if result.is_file() else "", cause="")
-    with staged(folder) as staging:
-        write_json(staging.area / MARK, {"schema": DONE_SCHEMA} | outcome.to_dict())
-        staging.commit()
+    with OutputFolder(folder).new_files() as area:
+        write_json(area / MARK, {"schema": DONE_SCHEMA} | outcome.to_dict())
     return outcome
 
 
@@ -59,13 +57,13 @@ def read_mark(folder: Path, *, checked: bool = True) -> Outcome | None:
 def held_soon(folder: Path, seconds: float = float("inf")) -> Iterator[None]:
     """Hold a row's folder; while another process does, which may be about to end, wait so long.
 
-    Raises `FolderInUse` when that was not long enough, else as `held_folder` does.
+    Raises `FolderInUse` when that was not long enough, else as `OutputFolder.held` does.
     """
     end = time.monotonic() + seconds
     with ExitStack() as stack:
         while True:
             try:
-                stack.enter_context(held_folder(folder))
+                stack.enter_context(OutputFolder(folder).held())
                 break
             except FolderInUse:
                 if time.monotonic() > end:
@@ -108,9 +106,8 @@ def make_plan(rows: Sequence[Row], overrides: Sequence[str], *, engine: str, wor
 
 def write_plan(plan: Plan, folder: Path) -> None:
     """Put plan.json in place; raises `ResourceError` when the disk refuses."""
-    with staged(folder) as staging:
-        write_json(staging.area / PLAN, {"schema": SCHEMA} | asdict(plan))
-        staging.commit()
+    with OutputFolder(folder).new_files() as area:
+        write_json(area / PLAN, {"schema": SCHEMA} | asdict(plan))
 
 
 def read_plan(folder: Path) -> Plan:

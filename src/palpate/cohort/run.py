@@ -12,15 +12,15 @@ from pathlib import Path
 
 from palpate.cohort.engines.packing import Engine
 from palpate.cohort.page import cohort_page
-from palpate.cohort.plan import CASES, MARK, PLAN, Plan, held_soon, make_plan, read_plan, write_plan
+from palpate.cohort.plan import CASES, MARK, PLAN, Plan, make_plan, read_plan, write_plan
 from palpate.cohort.progress import Tally
 from palpate.cohort.records import Record, records_of
 from palpate.cohort.statistics.document import statistics_document
 from palpate.cohort.tables import CSV, PARQUET, write_csv, write_parquet
 from palpate.cohort.task import Limits, Outcome, Row
-from palpate.errors import ConfigurationError, FolderInUse, InputDataError, PalpateError
+from palpate.errors import ConfigurationError, InputDataError, PalpateError
 from palpate.progress import Line, Progress, counted
-from palpate.study.outputs import STAGING, make_folder, staged, write_json, write_text
+from palpate.study.outputs import OutputFolder, make_folder, write_json, write_text
 from palpate.study.provenance import software_versions
 
 LOGGER = logging.getLogger(__name__)
@@ -66,10 +66,6 @@ def run_cohort(
     began = datetime.now(UTC).isoformat(timespec="seconds")
     plan = make_plan(rows, options.overrides, engine=engine.name, workers=options.workers, began=began)
     make_folder(folder / CASES)
-    for place in [folder / CASES / row.id for row in rows]:
-        if (place / STAGING).exists():  # whoever wrote there was killed, perhaps after the mark
-            with suppress(FolderInUse), held_soon(place, 0.0):
-                pass  # what was begun is ended by whoever holds the folder
     marks = plan.marks(folder)
     wanted = [number for number, mark in enumerate(marks) if _is_wanted(mark, options)]
     for number in wanted:
@@ -118,14 +114,13 @@ def close_cohort(plan: Plan, folder: Path, *, tables_only: bool = False) -> tupl
     tables_only: the first two alone. Raises `ResourceError` when the disk refuses, or a library is missing.
     """
     records = records_of(plan, folder)
-    with staged(folder) as staging:
-        write_csv(records, staging.area / CSV)
-        write_parquet(records, staging.area / PARQUET)
+    with OutputFolder(folder).new_files() as area:
+        write_csv(records, area / CSV)
+        write_parquet(records, area / PARQUET)
         if not tables_only:
             document = statistics_document(records)
-            write_json(staging.area / STATISTICS, document)
+            write_json(area / STATISTICS, document)
             version = software_versions().get("palpate", "")
             page = cohort_page(records, document, created=plan.began, version=version)
-            write_text(staging.area / PAGE, page)
-        staging.commit()
+            write_text(area / PAGE, page)
     return records

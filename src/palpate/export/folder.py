@@ -5,12 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from palpate.errors import ConfigurationError
 from palpate.export.fitted_model import FittedModel, fitted_model
 from palpate.export.formats import Options, format_named
 from palpate.export.model_file import read_model
 from palpate.study.earlier import refuse_any_result, seal_of
-from palpate.study.lock import held_folder
 from palpate.study.outputs import OutputFolder, make_folder
 from palpate.study.result import CaseResult
 
@@ -39,10 +37,8 @@ def export(
         model = fitted_model(result, seal=seal_of(result.to_dict()))
     else:
         model = read_model(Path(result))
-        if Path(result).resolve() == Path(output).resolve():
-            raise ConfigurationError(f"{output} is the folder of the result itself: choose another one for the export")
     outputs = OutputFolder(Path(output))
-    with held_folder(outputs.path):
+    with outputs.held():
         export_into(outputs, model, format, options)
     return tuple(outputs.path / name for name in outputs.written)
 
@@ -51,9 +47,8 @@ def export_into(outputs: OutputFolder, model: FittedModel, name: str, options: O
     """Put the files of the format `name` in place in a folder that is held; further pairs' in pair_2, pair_3 ..."""
     form = format_named(name)
     refuse_any_result(outputs.path)
-    with outputs.staged() as staging:
+    with outputs.new_files() as area:
         for number, body in enumerate(model.bodies if form.every_pair else model.bodies[:1], start=1):
-            folder = staging.area if number == 1 else make_folder(staging.area / f"pair_{number}")
+            folder = area if number == 1 else make_folder(area / f"pair_{number}")
             source = (options.source,) if form.refers else ()
             form.write(model, body.with_linear_tetrahedra() if options.linear else body, folder, *source)
-        staging.commit()

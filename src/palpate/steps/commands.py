@@ -20,7 +20,6 @@ from palpate.study import run
 from palpate.study.case import Case
 from palpate.study.check import CheckReport, check_case
 from palpate.study.earlier import refuse_other_result
-from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase
 from palpate.study.null_pair import NullPair, noise_of_drawings
 from palpate.study.outputs import RESULT, OutputFolder, read_json
@@ -49,7 +48,7 @@ def init(
     `ResourceError` where nothing can be written.
     """
     outputs = OutputFolder(Path(output))
-    with held_folder(outputs.path):
+    with outputs.held():
         table = None if labels is None else Path(labels)
         images = [Path(path) for path in (before, *after)]
         return new_case_with_page(images, table, outputs, cts=[Path(path) for path in ct])
@@ -197,7 +196,7 @@ def sensitivity(case: Case, *, output: PathLike | None = None, progress: Wanted 
         with shown_in_python(progress) as tell:
             return vary(case, progress=tell)
     outputs = OutputFolder(Path(output))
-    with held_folder(outputs.path), shown_in_python(progress) as tell:
+    with outputs.held(), shown_in_python(progress) as tell:
         refuse_other_result(case, outputs.path)
         found = vary(case, kept=Kept(outputs), progress=tell)
         save_sensitivity(found, outputs)

@@ -15,7 +15,6 @@ from palpate.report.figures.every import WrittenFigure, write_figures
 from palpate.report.figures.sheet import FORMATS
 from palpate.report.report_data import ReportData
 from palpate.study.earlier import refuse_any_result
-from palpate.study.lock import held_folder
 from palpate.study.outputs import DATA, RESULT, OutputFolder, read_json
 from palpate.study.result import SCHEMA, CaseResult
 
@@ -44,10 +43,8 @@ def figures(
     """
     refuse_settings(formats, dpi)
     data = collect(result) if isinstance(result, CaseResult) else read_data(Path(result))
-    if not isinstance(result, CaseResult) and Path(result).resolve() == Path(output).resolve():
-        raise ConfigurationError(f"{output} is the folder of the result itself: choose another one for the figures")
     outputs = OutputFolder(Path(output))
-    with held_folder(outputs.path):
+    with outputs.held():
         figures_into(outputs, data, formats=formats, unit=unit, dpi=dpi, progress=progress)
     return tuple(outputs.path / name for name in outputs.written)
 
@@ -63,10 +60,8 @@ def figures_into(
 ) -> tuple[WrittenFigure, ...]:
     """Put all figures in place in a folder that this process holds; raises as `figures` does."""
     refuse_any_result(outputs.path)
-    with outputs.staged() as staging:
-        drawn = write_figures(data, staging.area, formats=formats, unit=unit, dpi=dpi, progress=progress)
-        staging.commit()
-    return drawn
+    with outputs.new_files() as area:
+        return write_figures(data, area, formats=formats, unit=unit, dpi=dpi, progress=progress)
 
 
 def refuse_settings(formats: Sequence[str], dpi: int) -> None:

@@ -15,7 +15,6 @@ from palpate.report.preview import GENERATOR, preview_page
 from palpate.study.case import Case
 from palpate.study.case_file import toml_key
 from palpate.study.check import Checked, CheckReport, Problem, checked_case
-from palpate.study.lock import held_folder
 from palpate.study.new_case import NewCase, write_new_case
 from palpate.study.outputs import OutputFolder, read_regular, write_text
 from palpate.study.prediction import predicted_intervals
@@ -93,14 +92,14 @@ def new_case_with_page(
 def place_page(page: str, path: Path) -> None:
     """Put a page in its place; raises as `refuse_other_page`, and `ResourceError` where the disk refuses."""
     refuse_other_page(path)
-    with held_folder(path.parent):
-        _put(page, OutputFolder(path.parent), path.name)
+    outputs = OutputFolder(path.parent)
+    with outputs.held():
+        _put(page, outputs, path.name)
 
 
 def _put(page: str, outputs: OutputFolder, name: str) -> None:
-    with outputs.staged() as staging:
-        write_text(staging.area / name, page)
-        staging.commit()
+    with outputs.new_files() as area:
+        write_text(area / name, page)
 
 
 def refuse_other_page(path: Path) -> None:

@@ -19,7 +19,6 @@ from palpate.steps.saving import save_estimate
 from palpate.steps.warning_lines import warning_lines
 from palpate.study import result
 from palpate.study.earlier import refuse_other_case
-from palpate.study.lock import held_folder
 from palpate.study.outputs import OutputFolder
 
 if TYPE_CHECKING:
@@ -158,7 +157,7 @@ class CaseResult(_Shown, result.CaseResult):
         `ResourceError` where another run works there or the disk refuses.
         """
         outputs = OutputFolder(Path(folder), overwrite=overwrite)
-        with held_folder(outputs.path):
+        with outputs.held():
             refuse_other_case(self.case, outputs)
             save_estimate(self, outputs)
         return tuple(outputs.path / name for name in outputs.written)

@@ -27,13 +27,10 @@ if TYPE_CHECKING:
     from palpate.study.estimation import conclude as conclude
     from palpate.study.imaged import ImagedStates as ImagedStates
     from palpate.study.imaged import aligned as aligned
-    from palpate.study.lock import held_folder as held_folder
     from palpate.study.lock import own_file as own_file
     from palpate.study.outputs import OutputFolder as OutputFolder
     from palpate.study.outputs import make_folder as make_folder
     from palpate.study.outputs import read_json as read_json
-    from palpate.study.outputs import recover as recover
-    from palpate.study.outputs import staged as staged
     from palpate.study.outputs import write_json as write_json
     from palpate.study.provenance import software_versions as software_versions
     from palpate.study.read import read_states as read_states

@@ -6,7 +6,6 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +14,22 @@ from palpate.findings import Finding
 from palpate.study.case import Case
 from palpate.study.case_file import case_tables, case_text, read_case, relative_path
 from palpate.study.outputs import (
-    DATA,
-    PAGE,
+    DOCUMENTS,
     RESULT,
     RESULT_FILES,
-    Digests,
     OutputFolder,
-    Staging,
-    is_inside,
+    has_digest,
+    listed,
     read_json,
     sha256_of,
+    vouched,
     write_text,
 )
 from palpate.study.result import SCHEMA
 from palpate.study.schema import shortened
 
 CASE_NAME = "case.toml"
-DOCUMENTS = (RESULT, "mesh.json", "simulation.json", "sensitivity.json")  # each lists the files of its run
+Digests = Mapping[str, Mapping[str, str]]  # name of a file in the folder -> {"sha256": hexadecimal}
 UNSEALED = ("files", "warnings")  # which are added when the files take their places
 FURTHER_MESH = re.compile(r"mesh_\d+\.vtu")
 
@@ -118,20 +116,20 @@ def _named(name: str, patient: str, case: Case | None) -> str:
     return f"'{name}'{of}{image}"
 
 
-def stage_case(case: Case, staging: Staging) -> tuple[Finding, ...]:
-    """Stage case.toml as it was run, unless one of somebody's own in the folder says the same.
+def write_case(case: Case, outputs: OutputFolder, area: Path) -> tuple[Finding, ...]:
+    """Write case.toml as it was run into `area`, unless one of somebody's own in the output folder says the same.
 
     Gives the warnings of a result without it: it was changed meanwhile, or a path cannot be written in TOML.
     """
-    path = staging.folder / CASE_NAME
-    own = not path.exists() or CASE_NAME in vouched(staging.folder, RESULT)
+    path = outputs.path / CASE_NAME
+    own = not path.exists() or CASE_NAME in vouched(outputs.path, RESULT)
     if not own and _says(path, case):
         return ()
-    if not own and not (case.overrides and CASE_NAME in staging.written):  # by `palpate init`, in the same run
+    if not own and not (case.overrides and CASE_NAME in outputs.written):  # by `palpate init`, in the same run
         text = f"{path.name} in the output folder was changed during the run and is not the case of it."
         return (Finding("case-file", text),)
     try:
-        write_text(staging.area / CASE_NAME, case_text(case, staging.folder))
+        write_text(area / CASE_NAME, case_text(case, outputs.path))
     except ConfigurationError as error:
         return (Finding("case-file", f"the case of this run could not be written: {error}"),)
     return ()
@@ -151,42 +149,24 @@ def _says(path: Path, case: Case) -> bool:
     return case_tables(found, place) == case_tables(case, place)
 
 
-@dataclass(frozen=True, slots=True)
-class Earlier:
-    """Files of earlier runs: `retired` leave with the document that lists them, `aside` get another name.
+def earlier_files(folder: Path, document: str, files: Digests) -> tuple[Finding, ...]:
+    """Warnings on what is in `folder` when a run's `document` with its `files` takes its place there.
 
-    warnings: on what stays and could be taken for a file of the new run, or lists a file that the new run replaces.
+    They name what stays and could be taken for a file of the new run, and what lists a file that the run replaces.
     """
-
-    retired: tuple[str, ...]
-    aside: tuple[str, ...]
-    warnings: tuple[Finding, ...]
-
-
-def earlier_files(folder: Path, document: str, files: Digests) -> Earlier:
-    """What becomes of the files in `folder` when a run's `document` with its `files` takes its place there.
-
-    A page that no file vouches for is set aside: it would be read as that of the new result.
-    """
-    others = {other: _listed(folder, other) for other in DOCUMENTS if other != document}
-    shared = {name for listed in others.values() for name in listed}
-    retired = tuple(name for name in vouched(folder, document) if name not in files and name not in shared)
-    strange = [name for name in strange_files(folder, files) if name not in files and name not in retired]
-    aside = tuple(name for name in strange if name in (DATA, PAGE)) if document == RESULT else ()
-    left = [name for name in strange if name not in aside] if document == RESULT else []
+    gone = vouched(folder, document)
+    left = [name for name in strange_files(folder, files) if name not in files and name not in gone]
     warnings = []
-    if left:
+    if left and document == RESULT:
         words = "in the output folder are of an earlier run and do not belong to this result"
-        warnings.append(_warning(f"{', '.join(left)} {words}"))
-    if aside:
-        names = " and ".join(f"{name} as {name}.earlier" for name in aside)
-        warnings.append(_warning(f"files of an earlier run were set aside: {names}"))
-    for other, listed in others.items():
-        replaced = [name for name, sha256 in listed.items() if name in files and files[name]["sha256"] != sha256]
+        warnings.append(f"{', '.join(left)} {words}")
+    for other in DOCUMENTS:
+        before = {} if other == document else listed(folder, other)
+        replaced = [name for name, sha256 in before.items() if name in files and files[name]["sha256"] != sha256]
         if replaced:
             words = f"tells of an earlier run, whose {', '.join(replaced)} this run has replaced"
-            warnings.append(_warning(f"{other} in the output folder {words}"))
-    return Earlier(retired, aside, tuple(warnings))
+            warnings.append(f"{other} in the output folder {words}")
+    return tuple(Finding("earlier-files", warning) for warning in warnings)
 
 
 def seal_of(document: Mapping[str, Any]) -> str:
@@ -195,31 +175,9 @@ def seal_of(document: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(sealed, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
-def vouched(folder: Path, document: str) -> tuple[str, ...]:
-    """Names of the files in `folder` that are, byte by byte, those of the run that `document` there tells of."""
-    return tuple(name for name, sha256 in _listed(folder, document).items() if _is_file(folder / name, sha256))
-
-
 def strange_files(folder: Path, files: Digests) -> list[str]:
-    """Names of result files in `folder` that are not those of `files`, as `Staging.digests` gives them; sorted."""
+    """Names of result files in `folder` that are not those of `files`, as `digests_of` gives them; sorted."""
     further = [path for path in folder.glob("mesh_*.vtu") if FURTHER_MESH.fullmatch(path.name)]
     present = sorted({*further, *(folder / name for name in RESULT_FILES)})
     digests = {name: entry["sha256"] for name, entry in files.items()}
-    return [path.name for path in present if path.is_file() and not _is_file(path, digests.get(path.name))]
-
-
-def _listed(folder: Path, document: str) -> dict[str, str]:
-    """Name -> SHA-256 of the files that a document lists; nothing when there is none that could be read."""
-    try:
-        files: dict[str, Any] = read_json(folder / document).get("files", {})
-    except InputDataError:
-        return {}
-    return {name: entry["sha256"] for name, entry in files.items() if is_inside(folder, name)}
-
-
-def _is_file(path: Path, sha256: str | None) -> bool:
-    return path.is_file() and not path.is_symlink() and sha256 == sha256_of(path)
-
-
-def _warning(message: str) -> Finding:
-    return Finding("earlier-files", message)
+    return [path.name for path in present if path.is_file() and not has_digest(path, digests.get(path.name))]

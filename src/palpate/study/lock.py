@@ -11,7 +11,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from palpate.errors import FolderInUse, ResourceError
-from palpate.study.outputs import make_folder, recover
 
 if sys.platform != "win32":
     import fcntl
@@ -20,27 +19,6 @@ if sys.platform != "win32":
 NAME = ".palpate.lock"
 FLAGS = ("O_CREAT", "O_APPEND", "O_NOFOLLOW", "O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC")  # Windows lacks some
 NO_FILE = "is not a regular file of that folder (but a link, a pipe or a folder): remove it"
-
-
-@contextmanager
-def held_folder(folder: Path) -> Iterator[bool]:
-    """Make `folder`, hold it as `folder_lock` does, and complete or undo what a killed run left in it.
-
-    One that was made and is left empty vanishes again. Raises as `folder_lock` and `recover` do.
-    """
-    try:
-        made = [path for path in (folder, *folder.parents) if not path.exists()]  # the deepest first
-    except OSError:  # a name too long, a folder that may not be searched: making it says so
-        made = []
-    make_folder(folder)
-    try:
-        with folder_lock(folder) as locked:
-            recover(folder)
-            yield locked
-    finally:
-        for path in made:
-            with suppress(OSError):  # not empty: something was written
-                path.rmdir()
 
 
 @contextmanager

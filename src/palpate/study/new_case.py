@@ -21,10 +21,11 @@ from palpate.study.case_file import relative_path, toml_key, toml_text
 from palpate.study.case_tissue import REMAINING
 from palpate.study.earlier import CASE_NAME
 from palpate.study.guess import GuessedTissue, class_names, guess_tissues, movers_of
-from palpate.study.outputs import ASIDE, OutputFolder, read_regular, write_text
+from palpate.study.outputs import OutputFolder, read_regular, write_bytes, write_text
 from palpate.study.proposed_mesh import MARGIN_MM, background_of, proposed_edge, proposed_window
 
 LARGEST_CASE = 1_000_000  # bytes
+ASIDE = ".earlier"  # behind the name of a case.toml that makes room
 WIDE_MM = 250.0  # of an image: more than the body of many, so that it must show what lies around, too
 GUESSED_WITHIN = 2.0  # times and by what a known modulus is guessed: measured ones of one tissue differ so
 LEAST_NAME = 3  # letters that images' names share, to be a case's name
@@ -92,7 +93,7 @@ def write_new_case(
         )
     outputs.require([CASE_NAME])
     case = new_case(CaseImages(images[0], tuple(images[1:]), table, tuple(cts)), outputs.path)
-    aside: tuple[str, ...] = ()
+    earlier = b""
     if case.path.exists():
         try:
             content = read_regular(case.path, most_bytes=LARGEST_CASE)
@@ -105,10 +106,11 @@ def write_new_case(
                     f" {case.path}', or choose another --output; 'palpate estimate ... --overwrite' takes the new"
                     f" images and keeps that file as {CASE_NAME}{ASIDE}"
                 )
-            aside = (CASE_NAME,)
-    with outputs.staged() as staging:
-        write_text(staging.area / CASE_NAME, case.text)
-        staging.commit(aside=aside)
+            earlier = content
+    with outputs.new_files() as area:
+        write_text(area / CASE_NAME, case.text)
+        if earlier:
+            write_bytes(area / f"{CASE_NAME}{ASIDE}", earlier)
     return case
 
 

@@ -1,115 +1,44 @@
-"""The files that a run writes: made out of sight in the output folder, put in place all together or not at all.
+"""The files that a run writes: made out of sight in the output folder, put in place together or not at all.
 
-New files are made in `.writing-outputs/new`. When all are on the disk, those that give way step aside into `old`; then
-`new` is renamed to `ready`, which decides: from here on the new files move to their places, before it the old ones
-would move back. Either is done by whoever finds such a folder, so a kill is completed or undone by the next command.
+New files are made in `.writing-outputs`. When all are on the disk, the files that give way get a second name in a
+folder `earlier-...`. They then leave, documents first, and the new ones take their places, documents last. So a
+document never tells of files that are not beside it, and no new file stands beside one that gives way. Then the folder
+`earlier-...` goes. A kill in between leaves it, with the earlier files whole.
 """
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
+import secrets
 import shutil
 import signal
 import stat
-import threading
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from types import FrameType
 from typing import Any
 
 from palpate.errors import InputDataError, ResourceError
 from palpate.images.input_file import like
+from palpate.study.lock import folder_lock
 
-Digests = Mapping[str, Mapping[str, str]]  # name of a file in the folder -> {"sha256": hexadecimal}
-
-STAGING = ".writing-outputs"  # the hidden folder in an output folder
-NEW, READY, OLD = "new", "ready", "old"  # in it: being made; about to take their places; what gives way
-ASIDE = ".earlier"  # behind the name of a file that is set aside
+AREA = ".writing-outputs"  # the hidden folder for new files in an output folder
+EARLIER = "earlier-"  # begins the name of the folder that keeps what gives way
 LARGEST_DOCUMENT = 2**26  # bytes of a JSON document that is read
-SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 RESULT, PAGE, DATA = "result.json", "report.html", "report-data.npz"  # the document of an estimate, and its report
+DOCUMENTS = (RESULT, "mesh.json", "simulation.json", "sensitivity.json")  # each lists the files of its run
 KNOWN_IMAGES = "known-images.npz"  # what its images tell, for others that are added
-RESULT_FILES = (  # what else an estimate writes, with its case
-    DATA,
-    PAGE,
-    KNOWN_IMAGES,
-    "labels.csv",
-    "labels.nii.gz",
-    "mesh.vtu",
-    "model.npz",
-    "posterior.nc",
-    "stiffness.nii.gz",
-    "stiffness_sd.nii.gz",
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Staging:
-    """New files of an output folder, out of sight in `area` until `commit` puts all of them in place.
-
-    `written` gets the names of what took its place.
-    """
-
-    folder: Path
-    written: list[str] = field(default_factory=list)
-
-    @property
-    def area(self) -> Path:
-        """The folder to write into; a sub-folder of it becomes one of the output folder."""
-        return self.folder / STAGING / NEW
-
-    @property
-    def unfinished(self) -> bool:
-        """Whether a `commit` that failed is left to the next run in the folder, for it could not be undone either."""
-        return _is_unfinished(self.folder)
-
-    def names(self) -> tuple[str, ...]:
-        """The staged files, relative to the folder, with slashes; sorted, documents that list others last."""
-        return _files(self.area)
-
-    def digests(self) -> dict[str, dict[str, str]]:
-        """SHA-256 of each staged file, which tells a run's own files from an earlier run's."""
-        return {name: {"sha256": sha256_of(self.area / name)} for name in self.names()}
-
-    def discard(self, *names: str) -> None:
-        """Leave files out after all."""
-        for name in names:
-            (self.area / name).unlink(missing_ok=True)
-
-    def commit(self, *, retired: Collection[str] = (), aside: Collection[str] = ()) -> None:
-        """Put all staged files in place at once; `retired` files vanish, those `aside` get another name.
-
-        Killed in between, the next run in the folder completes it. Raises `ResourceError` when the disk refuses, with
-        everything as it was, unless it is left `unfinished`: else it may be tried again.
-        """
-        names, renamed = self.names(), [f"{name}{ASIDE}" for name in aside]
-        _refuse_improper(self.folder, (*names, *renamed, *aside))
-        try:
-            for name in aside:
-                shutil.copy2(self.folder / name, self.area / f"{name}{ASIDE}")
-            for name in (*names, *renamed):  # to the disk
-                with (self.area / name).open("rb+") as file:
-                    os.fsync(file.fileno())
-            _sync_folders(self.area)
-            # documents that list others leave first
-            leaving = [*reversed(names), *renamed, *retired, *(name for name in aside if name not in names)]
-            with _interrupts_deferred():
-                _exchange(self.folder, [name for name in leaving if (self.folder / name).exists()])
-                self.written.extend(names)
-        except OSError as error:
-            with suppress(OSError):
-                self.discard(*renamed)
-            raise _refused(self.folder, error) from error
+MAPS = ("stiffness.nii.gz", "stiffness_sd.nii.gz")
+RESULT_FILES = (DATA, PAGE, KNOWN_IMAGES, *MAPS, "labels.csv", "labels.nii.gz", "mesh.vtu", "model.npz", "posterior.nc")
 
 
 @dataclass(frozen=True, slots=True)
 class OutputFolder:
-    """A folder that this run holds; `written`: the names of what this run has put in place there.
+    """The folder that a run writes into; `written`: the names of what the run has put in place there.
 
     overwrite: whether the result of another case there may be replaced.
     """
@@ -118,118 +47,148 @@ class OutputFolder:
     written: list[str] = field(default_factory=list)
     overwrite: bool = False
 
+    @contextmanager
+    def held(self) -> Iterator[bool]:
+        """Make the folder and keep other runs out of it; one that was made and is left empty vanishes again.
+
+        Gives False where the file system knows no locks. Raises as `folder_lock` does.
+        """
+        try:
+            made = [path for path in (self.path, *self.path.parents) if not path.exists()]  # the deepest first
+        except OSError:  # a name too long, a folder that may not be searched: making it says so
+            made = []
+        make_folder(self.path)
+        try:
+            with folder_lock(self.path) as locked:
+                self._clear()
+                yield locked
+        finally:
+            for path in made:
+                with suppress(OSError):  # not empty: something was written
+                    path.rmdir()
+
     def require(self, names: Iterable[str]) -> None:
-        """Raise `ResourceError` where one of the files `names` could not be put in place; before they are computed."""
-        _refuse_improper(self.path, names)
+        """Raise `ResourceError` where something that no file can replace has one of the names.
 
-    def same_files(self, names: Iterable[str], files: Iterable[Path]) -> list[str]:
-        """Those of `names` in the folder that are one of `files`, of which some may not exist."""
-
-        def same(path: Path, other: Path) -> bool:
-            """Whether both are one file."""
+        A file may be replaced; a folder, a link, a pipe or a device may not, nor may a sub-folder be reached through a
+        link or be something else.
+        """
+        for name in names:
+            path = self.path / name
             try:
-                return path.samefile(other)
-            except (OSError, ValueError):
-                return False
-
-        others = list(files)
-        return [name for name in names if any(same(self.path / name, file) for file in others)]
+                if not is_inside(self.path, name):
+                    raise ResourceError(f"{path} leads out of the folder through a link: remove the link")
+                if path.parent.exists() and not path.parent.is_dir():
+                    raise ResourceError(
+                        f"{path.parent} is no folder, so the new {path.name} cannot lie there: remove it, or choose"
+                        " another --output folder"
+                    )
+                if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):
+                    raise ResourceError(
+                        f"{path} is no regular file (a folder, a link, a pipe ...), so the new {path.name} cannot take"
+                        " its place: remove it, or choose another --output folder"
+                    )
+            except OSError as error:
+                raise _refused(path, error) from error
 
     @contextmanager
-    def staged(self) -> Iterator[Staging]:
-        """Where files are written until they take their places; what was not committed is gone after the block."""
+    def new_files(self) -> Iterator[Path]:
+        """A hidden folder for new files, which take their places at the end of the block, unless that was left early.
+
+        A sub-folder of it becomes one of the output folder. With one of the DOCUMENTS, the files leave that the
+        document before it tells of. Raises `ResourceError` when the disk refuses, with everything as it was.
+        """
         make_folder(self.path)
-        recover(self.path)
+        area = self.path / AREA
+        self._clear()
         try:
-            for part in (NEW, OLD):
-                (self.path / STAGING / part).mkdir(parents=True)
-            yield Staging(self.path, self.written)
+            area.mkdir()
+            yield area
+            self._put_in_place(area)
         except OSError as error:
             raise _refused(self.path, error) from error
         finally:
-            _clear(self.path)
+            shutil.rmtree(area, ignore_errors=True)
 
+    def _clear(self) -> None:
+        """Remove the hidden folder of a run that was killed."""
+        area = self.path / AREA
+        if area.is_dir() and not area.is_symlink():
+            shutil.rmtree(area, ignore_errors=True)
+        if os.path.lexists(area):
+            raise ResourceError(f"{area} is no folder of Palpate's: remove it, or choose another --output folder")
 
-def recover(folder: Path) -> None:
-    """Complete or undo what a killed run left in `folder`, which this process holds, and remove its hidden files.
+    def _put_in_place(self, area: Path) -> None:
+        names = files_in(area)
+        self.require(names)
+        for name in names:  # to the disk
+            with (area / name).open("rb+") as file:
+                os.fsync(file.fileno())
+        replaced = [document for document in DOCUMENTS if document in names]
+        before = {name for document in replaced for name in listed(self.path, document)}
+        told = {name for of in DOCUMENTS for name in listed(area if of in names else self.path, of)}
+        retired = {name for document in replaced for name in vouched(self.path, document)} - told - {*names}
+        with _signals_wait():
+            if len(names) == 1 and not retired:  # a rename is whole in itself
+                _move(area / names[0], self.path / names[0])
+                _sync((self.path / names[0]).parent)
+            else:
+                self._exchange(area, names, retired, before)
+            self.written.extend(names)
 
-    Raises `ResourceError` when the renames are refused again, or the hidden folder is not one of Palpate's.
-    """
-    area = folder / STAGING
-    if any(path.is_symlink() or (path.exists() and not path.is_dir()) for path in (area, area / READY, area / OLD)):
-        raise ResourceError(f"{area} is no folder of Palpate's: remove it, or choose another --output folder")
-    try:
-        with _interrupts_deferred():
-            _settle(folder)
-    except OSError as error:
-        raise ResourceError(
-            f"{area} holds what an interrupted run left, and it cannot be completed ({error.strerror or error}): give"
-            " the right to write there, or choose another --output folder"
-        ) from error
-    _clear(folder)
-
-
-def _exchange(folder: Path, leaving: Sequence[str]) -> None:
-    """Move the `leaving` files aside and the staged ones to their places; an `OSError` leaves everything as it was."""
-    area = folder / STAGING
-    try:
-        for name in leaving:
-            _move(folder / name, area / OLD / name)
-        _sync_folders(area / OLD, *{(folder / name).parent for name in leaving})
-        (area / NEW).replace(area / READY)  # it is decided
-        _sync_folders(area)
-        _settle(folder)
-    except OSError as error:
+    def _exchange(self, area: Path, names: Sequence[str], retired: Iterable[str], before: Iterable[str]) -> None:
+        """Let the files of the area take their places and those `retired` leave; before: all of the earlier run."""
+        leaving = [name for name in (*retired, *names) if (self.path / name).exists()]
+        aside, moved = self.path / f"{EARLIER}{secrets.token_hex(4)}", list[str]()
         try:
-            decided = _settle(folder)
-        except OSError as again:
-            whose = "new files" if (area / READY).exists() else "files that were there"
-            raise ResourceError(
-                f"cannot write in {folder} ({again.strerror or again}): the {whose} are whole in {area}, from which the"
-                " next command with this folder completes them"
-            ) from error
-        if not decided:
+            for name in dict.fromkeys([*leaving, *before]):
+                _name_twice(self.path / name, aside / name)
+            _sync(*{(aside / name).parent for name in leaving})
+        except BaseException:
+            shutil.rmtree(aside, ignore_errors=True)
             raise
+        try:
+            for name in reversed(leaving):  # documents first
+                (self.path / name).unlink()
+            _sync(self.path)
+            for name in names:  # documents last
+                if name in DOCUMENTS:
+                    _sync(*{(self.path / other).parent for other in names})
+                moved.append(name)
+                _move(area / name, self.path / name)
+            _sync(*{(self.path / name).parent for name in names})
+        except BaseException as error:
+            self._put_back(aside, moved, error)
+            raise
+        shutil.rmtree(aside, ignore_errors=True)
+
+    def _put_back(self, aside: Path, moved: Iterable[str], cause: BaseException) -> None:
+        """Undo an exchange that was broken off; moved: names of new files that may be in their places."""
+        try:
+            for name in moved:
+                (self.path / name).unlink(missing_ok=True)
+            for name in files_in(aside):
+                if not (self.path / name).exists():
+                    _name_twice(aside / name, self.path / name)
+        except OSError as error:
+            raise ResourceError(
+                f"cannot write in {self.path} ({error.strerror or error}): the files that were there are whole in"
+                f" {aside}; move them back"
+            ) from cause
+        shutil.rmtree(aside, ignore_errors=True)
 
 
-def _settle(folder: Path) -> bool:
-    """Move files that are ready to their places, or else back what has stepped aside; whether it were those ready."""
-    area = folder / STAGING
-    decided = (area / READY).is_dir()
-    source = area / (READY if decided else OLD)
-    names = _files(source)
-    for name in names:
-        if not is_inside(folder, name):
-            raise ResourceError(f"{folder / name} leads out of the folder through a link: remove the link")
-        if decided or not os.path.lexists(folder / name):
-            _move(source / name, folder / name)
-    _sync_folders(*{(folder / name).parent for name in names})
-    if decided:  # what stepped aside must not come back
-        for name in _files(area / OLD):
-            if (folder / name).parent != folder:
-                with suppress(OSError):  # not empty
-                    (folder / name).parent.rmdir()
-        shutil.rmtree(area / OLD, ignore_errors=True)
-        if not _files(area / OLD):
-            shutil.rmtree(area / READY)
-    return decided
-
-
-def _is_unfinished(folder: Path) -> bool:
-    return (folder / STAGING / READY).exists() or bool(_files(folder / STAGING / OLD))
-
-
-def _clear(folder: Path) -> None:
-    """Remove the hidden folder, unless there is something to complete or to undo."""
-    if not _is_unfinished(folder):
-        shutil.rmtree(folder / STAGING, ignore_errors=True)
-
-
-def _files(folder: Path) -> tuple[str, ...]:
-    """Regular files below `folder`, relative to it, with slashes; sorted, documents that list others last."""
-    paths = [path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()]
-    names = [path.relative_to(folder).as_posix() for path in paths]
-    return tuple(sorted(names, key=lambda name: (name.endswith(".json"), name)))
+@contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Signals that end a run come after the block, where the system can hold them back."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _move(path: Path, place: Path) -> None:
@@ -237,44 +196,60 @@ def _move(path: Path, place: Path) -> None:
     path.replace(place)
 
 
-def _sync_folders(*folders: Path) -> None:
-    """Bring the names in folders, and in those below a hidden one, to the disk, where the system lets us."""
+def _name_twice(path: Path, second: Path) -> None:
+    """Give a file a second name; a copy where the file system has no hard links."""
+    if path.is_file() and not path.is_symlink():
+        second.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(path, second)
+        except OSError:
+            shutil.copy2(path, second)
+
+
+def _sync(*folders: Path) -> None:
+    """Bring the names in folders to the disk, where the system lets us."""
     for folder in folders:
-        below = [path for path in folder.rglob("*") if path.is_dir()] if STAGING in folder.parts else []
-        for place in (folder, *below):
-            with suppress(OSError):
-                file = os.open(place, os.O_RDONLY)
-                try:
-                    os.fsync(file)
-                finally:
-                    os.close(file)
+        with suppress(OSError):
+            file = os.open(folder, os.O_RDONLY)
+            try:
+                os.fsync(file)
+            finally:
+                os.close(file)
 
 
-@contextmanager
-def _interrupts_deferred() -> Iterator[None]:
-    """Keep signals that end a run until the block has ended; then they reach the handlers that were there before."""
-    if threading.current_thread() is not threading.main_thread():  # signals interrupt the main thread only
-        yield
-        return
-    came: list[int] = []
+def files_in(folder: Path) -> tuple[str, ...]:
+    """Regular files below `folder`, relative to it, with slashes; sorted, documents that list others last."""
+    paths = [path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()]
+    names = [path.relative_to(folder).as_posix() for path in paths]
+    return tuple(sorted(names, key=lambda name: (name in DOCUMENTS, name)))
 
-    def keep(number: int, frame: FrameType | None) -> None:
-        """Remember the signal."""
-        del frame
-        came.append(number)
 
-    numbers = [getattr(signal, name) for name in SIGNALS if hasattr(signal, name)]
-    handlers = {number: signal.getsignal(number) for number in numbers}
-    ours = {number: handler for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
+def digests_of(folder: Path) -> dict[str, dict[str, str]]:
+    """SHA-256 of each file below `folder`, as documents list them: name -> {"sha256": hexadecimal}."""
+    return {name: {"sha256": sha256_of(folder / name)} for name in files_in(folder)}
+
+
+def listed(folder: Path, document: str) -> dict[str, str]:
+    """Name -> SHA-256 of the files that a document lists; nothing when there is none that could be read."""
     try:
-        for number in ours:
-            signal.signal(number, keep)
-        yield
-    finally:
-        for number, handler in ours.items():
-            signal.signal(number, handler)
-        for number in came:
-            signal.raise_signal(number)
+        files: dict[str, Any] = read_json(folder / document).get("files", {})
+    except InputDataError:
+        return {}
+    return {name: entry["sha256"] for name, entry in files.items() if is_inside(folder, name)}
+
+
+def vouched(folder: Path, document: str) -> set[str]:
+    """Names of the files in `folder` that are, byte by byte, those of the run that `document` there tells of.
+
+    Or of one whose files a killed run has left in a folder `earlier-...`.
+    """
+    told = [of for place in (folder, *folder.glob(f"{EARLIER}*")) for of in listed(place, document).items()]
+    return {name for name, sha256 in told if is_inside(folder, name) and has_digest(folder / name, sha256)}
+
+
+def has_digest(path: Path, sha256: str | None) -> bool:
+    """Whether there is a regular file with that SHA-256."""
+    return path.is_file() and not path.is_symlink() and sha256 == sha256_of(path)
 
 
 def is_inside(folder: Path, name: str) -> bool:
@@ -283,11 +258,6 @@ def is_inside(folder: Path, name: str) -> bool:
     if not path.parts or path.is_absolute() or ".." in path.parts or "\0" in name or str(path) != name:
         return False
     return not any((folder / parent).is_symlink() for parent in path.parents if parent.parts)
-
-
-def staged(folder: Path) -> AbstractContextManager[Staging]:
-    """`OutputFolder.staged` of a folder that nobody else writes to."""
-    return OutputFolder(folder).staged()
 
 
 def make_folder(folder: Path) -> Path:
@@ -329,7 +299,9 @@ def read_regular(path: Path, *, most_bytes: int) -> bytes:
                 raise InputDataError(f"{path} has {status.st_size} bytes, more than Palpate writes; estimate again")
             return stream.read(most_bytes)
     except FileNotFoundError as error:
-        advice = like(path) or "; run the estimate first, which writes it"
+        kept = [str(place) for place in path.parent.glob(f"{EARLIER}*/{path.name}")]
+        advice = f"; a run that was killed left the earlier one: {kept[0]}" if kept else like(path)
+        advice = advice or "; run the estimate first, which writes it"
         raise InputDataError(f"there is no {path}{advice}") from error
     except OSError as error:
         raise InputDataError(
@@ -366,43 +338,14 @@ def sha256_of(path: Path) -> str:
         raise _refused(path, error) from error
 
 
-def _refuse_improper(folder: Path, names: Iterable[str]) -> None:
-    """Raise `ResourceError` where something that no file can replace has a name that is to be written in `folder`.
-
-    A file may be replaced; a folder, a link, a pipe, a device or a file protected by the system may not, nor may a
-    sub-folder be reached through a link or be something else.
-    """
-    for name in names:
-        path = folder / name
-        try:
-            if not is_inside(folder, name):
-                raise ResourceError(f"{path} leads out of the folder through a link: remove the link")
-            if path.parent.exists() and not path.parent.is_dir():
-                raise ResourceError(
-                    f"{path.parent} is no folder, so the new {path.name} cannot lie there: remove it, or choose another"
-                    " --output folder"
-                )
-            if not os.path.lexists(path):
-                continue
-            if not stat.S_ISREG(path.lstat().st_mode):
-                raise ResourceError(
-                    f"{path} is no regular file (a folder, a link, a pipe ...), so the new {path.name} cannot take its"
-                    " place: remove it, or choose another --output folder"
-                )
-            os.close(os.open(path, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)))
-        except OSError as error:
-            if error.errno != errno.EACCES:  # no hindrance to replacing; EPERM: protected by the file system
-                raise _refused(path, error) from error
-
-
 def no_constant(name: str) -> float:
     """Raise `ValueError` for what JSON does not know and Python's reader takes all the same: NaN, Infinity."""
     raise ValueError(f"{name} is no number")
 
 
 def _refused(path: Path, error: OSError) -> ResourceError:
-    hidden = path.parts.index(STAGING) if STAGING in path.parts else len(path.parts)
-    shown = Path(*path.parts[:hidden], *path.parts[hidden + 2 :])  # where it would have come to stand
+    hidden = path.parts.index(AREA) if AREA in path.parts else len(path.parts)
+    shown = Path(*path.parts[:hidden], *path.parts[hidden + 1 :])  # where it would have come to stand
     return ResourceError(
         f"cannot write {shown}: {error.strerror or error}; free some space or choose another --output folder"
     )

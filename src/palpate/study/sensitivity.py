@@ -38,7 +38,7 @@ from palpate.study.case_file import case_tables
 from palpate.study.edge_length import edge_length_of
 from palpate.study.estimation import conclude
 from palpate.study.inverted import inverted
-from palpate.study.outputs import OutputFolder, read_json, write_json
+from palpate.study.outputs import OutputFolder, make_folder, read_json, write_json
 from palpate.study.provenance import software_versions
 from palpate.study.read import CaseImages, read_case_images
 from palpate.study.result import Provenance, closing, json_object
@@ -73,10 +73,9 @@ class Kept:
         """Keep a part, whole or not at all; raises `ResourceError` where the disk refuses."""
         if self.outputs is None:
             return
-        with self.outputs.staged() as staging:
-            (staging.area / KEPT).mkdir()
-            write_json(staging.area / KEPT / f"{name}-{key[:16]}.json", json_object(part) | {"key": key})
-            staging.commit()
+        with self.outputs.new_files() as area:
+            make_folder(area / KEPT)
+            write_json(area / KEPT / f"{name}-{key[:16]}.json", json_object(part) | {"key": key})
 
 
 @dataclass(frozen=True, slots=True)

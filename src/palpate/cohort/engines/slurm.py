@@ -24,7 +24,7 @@ from palpate.errors import InputDataError, PalpateError, ResourceError
 from palpate.parallel import mapped
 from palpate.progress import Line, Progress
 from palpate.study.cost import expected_cost
-from palpate.study.outputs import read_json, staged, write_json, write_text
+from palpate.study.outputs import OutputFolder, read_json, write_json, write_text
 from palpate.study.read import read_states
 
 FOLDER, PARTS, SCRIPT, JOB = "slurm", "parts.json", "array.sh", "job.json"
@@ -109,16 +109,14 @@ class SlurmEngine:
             "#SBATCH --requeue",
             f'exec {command} --task "$SLURM_ARRAY_TASK_ID"',
         ]
-        with staged(place) as staging:
-            write_json(staging.area / PARTS, {"schema": "palpate.parts/1", "parts": parts})
-            write_text(staging.area / SCRIPT, "\n".join(script) + "\n")
-            staging.commit()
+        with OutputFolder(place).new_files() as area:
+            write_json(area / PARTS, {"schema": "palpate.parts/1", "parts": parts})
+            write_text(area / SCRIPT, "\n".join(script) + "\n")
         job = _run("sbatch", "--parsable", str(place / SCRIPT)).split(";")[0].strip()
         if not JOB_NUMBER.fullmatch(job):
             raise ResourceError(f"sbatch did not take the job array {place / SCRIPT}: {job[:200]}")
-        with staged(place) as staging:
-            write_json(staging.area / JOB, {"schema": "palpate.job/1", "job": job})
-            staging.commit()
+        with OutputFolder(place).new_files() as area:
+            write_json(area / JOB, {"schema": "palpate.job/1", "job": job})
         return job
 
 
