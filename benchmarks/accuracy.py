@@ -206,7 +206,7 @@ def at_truth(inversion: Inversion, problem: InverseProblem, scene: Scene) -> Inv
     unknowns[columns[: len(coefficients)]] = coefficients
     place = LinearisationPoint(mapping.moduli(unknowns), mapping.coefficients(unknowns)[0])
     exact = exact_approximation(state.model, state.finite_strain, place)
-    objective = Objective(problem.states, mapping).under([exact])
+    objective = Objective(problem.states, mapping).with_approximations([exact])
     objective = objective.with_observations([o.with_noise(noise[o.kind]) for o in objective.observations])
     objective = objective.rematched(unknowns)
     minimum = replace(inversion.minimum, unknowns=unknowns, evaluation=objective(unknowns))

@@ -132,7 +132,7 @@ def _exact(objective: Objective, unknowns: Array, *, finite_strain: bool = False
     """The objective on full models that are solved at unknowns (n_unknowns,), linear ones or the states' others."""
     moduli, coefficients = objective.parameters.moduli(unknowns), objective.parameters.coefficients(unknowns)
     models = [(state.model, state.finite_strain if finite_strain else None) for state in objective.states]
-    return objective.under(
+    return objective.with_approximations(
         [exact_approximation(*m, LinearisationPoint(moduli, q)) for m, q in zip(models, coefficients, strict=True)]
     )
 

@@ -167,7 +167,7 @@ def _body(scene: Scene, row: Row, edge_mm: float) -> Body:
     theta, n = linear.minimum.unknowns[: problem.parameters.n_parameters], problem.parameters.n_parameters
     known = linear.objective.states[0]
     if state.finite_strain is not None:
-        finite = state.finite_strain.under(known.model.conditions)
+        finite = state.finite_strain.with_conditions(known.model.conditions)
         known = replace(known, finite_strain=replace(finite, material=known.model.material))
     parameters = replace(linear.objective.parameters, priors=())  # to be learned anew
     truth = np.log(true_ratios(linear.objective, scene))

@@ -255,7 +255,7 @@ def _gradient(sizes: Sizes, seed: int, say: Say) -> Result:
     offline_s = time.perf_counter() - began
     theta = np.log(posed.moduli[mapping.selection.argmax(axis=0)] / mapping.scale_kpa)
     unknowns = np.concatenate([theta, coefficients])
-    objective = Objective(problem.states, mapping).under([basis])
+    objective = Objective(problem.states, mapping).with_approximations([basis])
     objective = objective.with_observations([o.with_noise(SEGMENTATION_NOISE) for o in objective.observations])
     objective = objective.rematched(unknowns)
     frozen = peers.frozen_misfit(objective, unknowns)

@@ -55,7 +55,7 @@ class Body:
 
     def under(self, constraint):
         conditions = Conditions(constraint)
-        return Body(self.linear.under(conditions), self.finite.under(conditions), self.law)
+        return Body(self.linear.with_conditions(conditions), self.finite.with_conditions(conditions), self.law)
 
 
 def of_reduced_basis(body, at):

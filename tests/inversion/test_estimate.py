@@ -201,7 +201,9 @@ def test_the_full_model_finds_the_same_where_the_reduced_one_stands(twins, twin,
     found = of_voxels
     moduli = found.objective.parameters.moduli(found.minimum.unknowns)
     place = LinearisationPoint(moduli, found.minimum.unknowns[2:])
-    start = begun(found.objective.under([exact_approximation(twin.model, None, place)]), found.minimum.unknowns)
+    start = begun(
+        found.objective.with_approximations([exact_approximation(twin.model, None, place)]), found.minimum.unknowns
+    )
     end = searched(start, twins.settings(1.0).bounds, REPORTED, progress=twins.silent, title="")
     assert end.minimum.converged
     assert np.all(np.abs(end.posterior.mean - found.mixture.mean) < 0.1 * posterior_sd(found.minimum, 2))

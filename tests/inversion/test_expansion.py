@@ -75,7 +75,9 @@ def test_the_law_that_made_the_data_finds_the_moduli(twins, linear, continued):
 def ended(request, twins, settings, continued):
     """Where a search goes on to whose derivatives are made exact: up to so many of them all."""
     (approximation,) = continued.objective.approximations
-    start = begun(continued.objective.under([replace(approximation, few=request.param)]), continued.minimum.unknowns)
+    start = begun(
+        continued.objective.with_approximations([replace(approximation, few=request.param)]), continued.minimum.unknowns
+    )
     return searched(start, settings.bounds, REPORTED, progress=twins.silent, title="")
 
 

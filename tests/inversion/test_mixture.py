@@ -112,7 +112,7 @@ def test_each_explanation_comes_with_its_minimum(seen):
     of, objective = seen
     x = place(of)
     for each in compared(of, objective)[:4]:
-        there = objective.believing(objective.parameters.choosing(dict(each.chosen)))(each.unknowns)
+        there = objective.with_prior(objective.parameters.choosing(dict(each.chosen)))(each.unknowns)
         trusted = np.zeros(len(x))
         trusted[:2] = TRUSTED_SD**-2.0 * (each.unknowns[:2] - AWAY)
         assert np.abs(there.score + trusted).max() < 1e-6 * np.abs(objective(x).score).max()
@@ -362,7 +362,7 @@ def test_the_level_of_an_explanation_is_that_of_its_robust_losses(patients):
     objective, outlying, found = with_outliers(of.objective(rng)), [], []
     for k in range(3):
         chosen = {0: k, 1: k, 2: 0, 3: 0, FRAME: 0, GLAND: 0, SAC: 0}
-        own = objective.believing(objective.parameters.choosing(chosen))
+        own = objective.with_prior(objective.parameters.choosing(chosen))
         minimum = robust_minimum(own, np.zeros(len(of.truth)))
         there, scenario = minimum.evaluation, Candidates(lambda each, own=chosen: each.chosen == tuple(own.items())[:5])
         at = cheapest_posterior(objective, minimum.unknowns, there)

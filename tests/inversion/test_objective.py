@@ -29,7 +29,7 @@ def objective_of(problem, *, loss=None, precision=30.0) -> Objective:
     parameters = problem.parameters
     moduli = parameters.moduli(np.zeros(2))
     bases = [basis_of(state.model, moduli, parameters) for state in problem.states]
-    objective = Objective(problem.states, parameters).under(bases)
+    objective = Objective(problem.states, parameters).with_approximations(bases)
     weighting = Weighting(precision, loss or PowerLaw())
     return objective.with_observations([replace(o, weighting=weighting) for o in objective.observations])
 
@@ -141,7 +141,7 @@ def test_the_modes_of_one_image_do_not_move_the_other(twins, twin):
 
 
 def test_at_the_truth_only_the_prior_pulls(twin, exact):
-    objective = objective_of(exact).under([basis_of(twin.model, twin.moduli, exact.parameters)])
+    objective = objective_of(exact).with_approximations([basis_of(twin.model, twin.moduli, exact.parameters)])
     now = objective(twin.unknowns)
     prior = np.concatenate([np.zeros(2), twin.coefficients])
     assert now.misfit_mm2 < 1e-16
@@ -178,7 +178,7 @@ def test_derivatives_are_exact_along_what_decides_with_layers_too(twins, twin):
     """So that what is compared next needs no model made exact there again."""
     held, unknowns = with_a_held_tissue(twins, twin, sd=0.4)
     evaluation, (basis,) = held(unknowns), held.approximations
-    free = evaluation.under(freed(held), unknowns)
+    free = evaluation.with_prior(freed(held), unknowns)
     (point,) = held.linearisation_points(unknowns, [evaluation, free])
     along = freed(held).chain(0, unknowns) @ deciding_directions(free, 2)[freed(held).unknowns_of(0)]
     assert np.allclose(point.directions[:, 4:], along[:, 2:], atol=1e-12)
@@ -194,7 +194,7 @@ def test_derivatives_are_exact_along_what_decides_with_layers_too(twins, twin):
 def test_another_prior_is_the_same_as_evaluated_under_it(twins, twin):
     held, unknowns = with_a_held_tissue(twins, twin, sd=0.4)
     unknowns[-1] = 0.1
-    seen, anew = held(unknowns).under(freed(held), unknowns), held.believing(freed(held))(unknowns)
+    seen, anew = held(unknowns).with_prior(freed(held), unknowns), held.with_prior(freed(held))(unknowns)
     pairs = [(getattr(seen, name), getattr(anew, name)) for name in ("value", "score", "prior_score")]
     pairs += [(seen.matrix.dense, anew.matrix.dense), (seen.prior.dense, anew.prior.dense)]
     for found, expected in pairs:
@@ -205,6 +205,6 @@ def test_a_known_tissue_released_as_a_whole_is_a_prior_of_the_scale(twins, twin)
     """Moduli scaled together leave u unchanged: ln E of all organs then varies by as much as that of the tissue."""
     sd = 0.4
     held, unknowns = with_a_held_tissue(twins, twin, sd)
-    seen = held(unknowns).under(freed(held), unknowns)
+    seen = held(unknowns).with_prior(freed(held), unknowns)
     before, after = (of.covariance_columns(2)[:2] for of in (held(unknowns), seen))
     assert after - before == pytest.approx(np.full((2, 2), sd**2), rel=0.02)

@@ -81,7 +81,7 @@ def test_what_it_cost_adds_up(first, twin):
 
 def evaluated(twins, problem, basis, unknowns):
     """The evaluation on a basis at some unknowns, by the noise of segmentations."""
-    objective = twins.objective_of(problem).under([basis])
+    objective = twins.objective_of(problem).with_approximations([basis])
     rough = objective.with_observations([o.with_noise(SEGMENTATION_NOISE) for o in objective.observations])
     return rough.rematched(unknowns)(unknowns)
 

@@ -63,7 +63,7 @@ def test_intervals_of_many_images_hold_with_an_error_of_the_reference_image(pati
         of = replace(of, truth=np.append(of.truth[:2], DRAWN * rng.standard_normal(len(of.truth) - 2)))
         shared = of.objective(rng)
         none = replace(shared.parameters, blocks=unit_blocks(*8 * (0,)), priors=())
-        for name, objective in (("shared", shared), ("new", shared.believing(none))):
+        for name, objective in (("shared", shared), ("new", shared.with_prior(none))):
             mixture = mixture_at(objective, patients)
             found[name] += list((mixture.mean - of.truth[:2]) ** 2 / np.diag(mixture.covariance))
     assert np.mean(found["shared"]) == pytest.approx(1.0, abs=3.0 * np.sqrt(2.0 / len(found["shared"])))
@@ -103,7 +103,7 @@ def test_the_score_of_an_objective_is_its_slope(patients, n_images, volume):
     objective = of.objective(rng, whole=True)
     if volume:
         room = Volume(np.array([-30.0, 20.0]), np.array([0.1, 0.4]))
-        objective = objective.believing(replace(objective.parameters, volume=room))
+        objective = objective.with_prior(replace(objective.parameters, volume=room))
     x = 0.3 * rng.standard_normal(of.parameters.n_unknowns)
     now, linear = objective(x), LinearisedObjective(objective, x, objective(x))
     for each in (objective, fixed_correspondence(objective, x, now), linear):

@@ -137,8 +137,8 @@ def test_the_objective_stays_once_it_is_settled(patients, bent):
     body = bent[0].bodies[0]
     values = []
     for place in settled:
-        whole = place.objective.under([patients.Whole(body)])
-        values.append(whole.believing(whole.parameters.choosing(chosen))(first.minimum.unknowns).value)
+        whole = place.objective.with_approximations([patients.Whole(body)])
+        values.append(whole.with_prior(whole.parameters.choosing(chosen))(first.minimum.unknowns).value)
     assert values == pytest.approx([values[0]] * len(values), rel=1e-12)
 
 
@@ -206,9 +206,9 @@ LINE = Bounds(np.full(1, -4.0), np.full(1, 4.0))
 
 def at_their_best(problem, whole):
     """Of the still and the moving frame: level, by Laplace's approximation at its own best, and all unknowns there."""
-    objective, found = Objective(problem.states, problem.parameters).under([whole]), []
+    objective, found = Objective(problem.states, problem.parameters).with_approximations([whole]), []
     for k, alternative in enumerate(problem.parameters.blocks[0].alternatives):
-        own = objective.believing(objective.parameters.choosing({0: k}))
+        own = objective.with_prior(objective.parameters.choosing({0: k}))
         minimum = gauss_newton(own, np.zeros(2), bounds=LINE, tolerance=1e-10)
         there = minimum.evaluation
         determinants = alternative.log_determinant - np.linalg.slogdet(there.matrix.dense)[1]
@@ -220,7 +220,9 @@ def seen_from(problem, unknowns):
     """Levels of the still and the moving frame, where the model is exact at unknowns (2,)."""
     objective = Objective(problem.states, problem.parameters)
     points = objective.linearisation_points(unknowns)
-    objective = objective.under([of.update(at) for of, at in zip(objective.approximations, points, strict=True)])
+    objective = objective.with_approximations(
+        [of.update(at) for of, at in zip(objective.approximations, points, strict=True)]
+    )
     there = objective(unknowns)
     mixture = mixture_of(cheapest_posterior(objective, unknowns, there), unknowns, there, LINE)
     return {of.chosen[0]: of.level for of in mixture.explanations}
@@ -349,7 +351,7 @@ def folded(patients, bent, times):
     start = begin(bent[1])
     (whole,) = start.objective.approximations
     approximation = Folded(whole.body, whole.model)
-    return replace(start, objective=start.objective.under([approximation]))
+    return replace(start, objective=start.objective.with_approximations([approximation]))
 
 
 def test_a_step_to_where_nothing_can_be_solved_is_halved(patients, bent):

@@ -135,7 +135,7 @@ def objective_of(problem, coefficients=None) -> Objective:
     bases = [reduced_basis(state.model, moduli) for state in problem.states]
     if coefficients is not None:
         bases = [basis.with_modulus_series(coefficients, parameters.selection) for basis in bases]
-    return with_first_noise(Objective(problem.states, parameters).under(bases))
+    return with_first_noise(Objective(problem.states, parameters).with_approximations(bases))
 
 
 def settings(*ratios, limits=(0.02, 200.0), n=2, **others) -> InversionSettings:

@@ -177,14 +177,14 @@ def test_derivatives_along_directions_need_no_factorisation(model):
 
 def test_other_modes_of_the_same_points_need_no_new_model(model):
     constraint = replace(model.constraint, modes=model.constraint.modes[:, :1], offset=model.constraint.modes[:, 1])
-    found = model.under(Conditions(constraint)).solve(MODULI, np.array([3.0])).values
+    found = model.with_conditions(Conditions(constraint)).solve(MODULI, np.array([3.0])).values
     assert np.allclose(found, model.solve(MODULI, np.array([3.0, 1.0])).values, atol=1e-8)
 
 
 def test_a_constraint_that_frees_other_points_is_refused(model, meshes):
     _, constraint = meshes.pushed_block(outer="sliding")
     with pytest.raises(ConfigurationError, match="other free displacements"):
-        model.under(Conditions(constraint))
+        model.with_conditions(Conditions(constraint))
 
 
 def test_a_motion_beyond_the_body_ends_in_a_sentence_at_a_sound_state(model):

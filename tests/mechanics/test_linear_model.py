@@ -168,7 +168,7 @@ def test_a_constraint_of_another_space_is_refused(model, meshes):
 
 def test_other_modes_of_the_same_points_need_no_new_assembly(model):
     constraint = replace(model.constraint, modes=model.constraint.modes[:, :2], offset=3.0 * model.constraint.offset)
-    quick, anew = model.under(Conditions(constraint)), linear_model(model.space, constraint)
+    quick, anew = model.with_conditions(Conditions(constraint)), linear_model(model.space, constraint)
     assert quick.stiffness is model.stiffness
     found, expected = (m.solve(MODULI, np.array([1.0, -2.0])).values for m in (quick, anew))
     assert np.allclose(found, expected, atol=1e-12 * abs(expected).max())
@@ -178,4 +178,4 @@ def test_a_constraint_that_frees_other_points_needs_a_new_assembly(model, meshes
     points = np.unique(model.space.facets(model.space.mesh.boundary))
     given = meshes.prescribe(model.space, points, np.zeros((len(points), 3)))
     with pytest.raises(ConfigurationError, match="other free displacements"):
-        model.under(Conditions(outer_constraint(model.space, outer="free", **given)))
+        model.with_conditions(Conditions(outer_constraint(model.space, outer="free", **given)))

@@ -154,9 +154,9 @@ def test_a_projection_serves_another_state_of_the_body_on_the_same_vectors(model
     """Its offset and loads are others, its modes are the same."""
     vectors, moduli, q = basis(model), np.array([1.0, 5.0]), np.array([1.0, -2.0])
     constraint = replace(model.constraint, offset=-0.3 * model.constraint.offset)
-    other = model.under(replace(model.conditions, constraint=constraint))
+    other = model.with_conditions(replace(model.conditions, constraint=constraint))
     first = projection(model, vectors)
-    there, anew = first.under(other), projection(other, vectors)
+    there, anew = first.with_model(other), projection(other, vectors)
     assert there.reduced.output_basis[0] is first.reduced.output_basis[0]
     assert there.reduced.solve(moduli, q).values == pytest.approx(anew.reduced.solve(moduli, q).values, abs=1e-9)
 
@@ -164,9 +164,9 @@ def test_a_projection_serves_another_state_of_the_body_on_the_same_vectors(model
 def test_states_of_a_body_with_vectors_of_their_own_share_what_is_common_of_the_factor(model):
     vectors, moduli, q = basis(model), np.array([1.0, 5.0]), np.array([1.0, -2.0])
     constraint = replace(model.constraint, offset=-0.3 * model.constraint.offset)
-    other = model.under(replace(model.conditions, constraint=constraint))
+    other = model.with_conditions(replace(model.conditions, constraint=constraint))
     first = projection(model, vectors[:, :6])
-    bent = first.under(other).extended(vectors[:, 9:11]).reduced
+    bent = first.with_model(other).extended(vectors[:, 9:11]).reduced
     first = first.extended(vectors[:, 6:9]).reduced
     assert common_vectors(first, bent) == 6
     assert common_vectors(first, first) == first.n_basis

@@ -126,7 +126,7 @@ class Spring:
 def of_force(_sphere, _point_motion):
     spring = Spring(np.arange(6), np.zeros(3))
     term = Force("force", *stated_noise(0.2, 1), spring, np.eye(3)[2], 1.5)
-    return term.under(np.array([2.0, 3.0]), np.zeros(2))
+    return term.with_material(np.array([2.0, 3.0]), np.zeros(2))
 
 
 MAKERS = {
@@ -286,7 +286,7 @@ def test_what_depends_on_the_moduli_says_how(sphere, point_motion):
     start = seen.residuals(place)
     remainders = [
         abs(
-            seen.under(np.array([2.0, 3.0]) * np.exp(h * change), np.zeros(2)).residuals(place).values[0]
+            seen.with_material(np.array([2.0, 3.0]) * np.exp(h * change), np.zeros(2)).residuals(place).values[0]
             - start.values[0]
             - h * (start.direct[0, :2] @ change)
         )

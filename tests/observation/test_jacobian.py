@@ -40,7 +40,7 @@ def test_it_is_the_product_of_its_factors(whole, rng):
 def test_other_derivatives_of_the_displacement_leave_those_by_offsets(whole, rng):
     jacobian, dense = whole
     tangent = rng.standard_normal((12, 7))
-    other = jacobian.under(tangent).dense
+    other = jacobian.with_tangent(tangent).dense
     assert other[:, 7:] == pytest.approx(dense[:, 7:])
     assert other[:, :7] == pytest.approx(jacobian.by_displacement[:, :-1] @ tangent)
 

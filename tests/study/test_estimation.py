@@ -244,7 +244,7 @@ def of_two(inversion, *, share=0.5, away=1.0, chosen=({}, {})):
     parameters = inversion.objective.parameters
     first, *rest = parameters.blocks
     first = replace(first, alternatives=(first.alternatives[0],) * 2)  # what is chosen must be there
-    objective = inversion.objective.believing(replace(parameters, blocks=(first, *rest)))
+    objective = inversion.objective.with_prior(replace(parameters, blocks=(first, *rest)))
     return replace(inversion, objective=objective, mixture=replace(inversion.mixture, explanations=both))
 
 
@@ -463,8 +463,8 @@ def test_an_interval_that_could_not_be_followed_says_so_and_blames_no_bound(inve
         def parameters(self):
             return self.of.parameters
 
-        def believing(self, parameters):
-            return Brittle(self.of.believing(parameters))
+        def with_prior(self, parameters):
+            return Brittle(self.of.with_prior(parameters))
 
         def __call__(self, unknowns):
             if np.any(np.abs(unknowns - minimum.unknowns)[:2] > 1.5 * sd):

@@ -149,7 +149,7 @@ def test_with_a_layer_the_others_are_at_their_best_along_a_ray_of_all_moduli(she
     points, _ = ray.to_level(2.0, first=0.3)
     layers = frozen.parameters.free_on_moduli
     others = np.setdiff1d(np.arange(2, len(inversion.minimum.unknowns)), layers)
-    plain = frozen.believing(replace(frozen.parameters, volume=None))
+    plain = frozen.with_prior(replace(frozen.parameters, volume=None))
 
     def left(x):
         """J and the room of all but moduli and layers, these being held."""

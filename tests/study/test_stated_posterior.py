@@ -33,7 +33,7 @@ def poor(inversion, twin):
     basis, stiffer = reduced_basis(twin.model, mapping.moduli(theta)), theta + np.append([1.0, 1.0], 0.0 * theta[2:])
     responses = twin.model.system(mapping.moduli(stiffer)).responses()[:, :-1]
     free = np.asarray(twin.model.constraint.free.T @ responses)
-    return inversion.objective.under([replace(basis, projection=basis.projection.extended(free))])
+    return inversion.objective.with_approximations([replace(basis, projection=basis.projection.extended(free))])
 
 
 def posterior_of(objective, minimum):
@@ -70,7 +70,7 @@ def on_poor(request, poor, expansion):
     """The objective on the poor basis, or on an expansion that bends as that does: of one law they are the same."""
     if request.param == "itself":
         return poor
-    (state,) = poor.under([expansion]).states
+    (state,) = poor.with_approximations([expansion]).states
     return replace(poor, states=(replace(state, bending=poor.approximations[0]),))
 
 
@@ -81,7 +81,7 @@ def test_profiles_end_where_those_of_the_full_model_do(inversion, poor, on_poor,
     for of in profiles(found, bounds):
         for place in of.outermost:
             at, (model,) = full.linearisation_points(place)[0], full.approximations
-            full = full.under([model.with_responses(at.moduli, at.coefficients)])
+            full = full.with_approximations([model.with_responses(at.moduli, at.coefficients)])
     half = NORMAL_95 * np.sqrt(np.diag(found.covariance)[:2])[:, None]
     truth = ends(posterior_of(full, inversion.minimum), bounds)
     off = [np.abs(ends(of, bounds) - truth) / half for of in (before, found)]
@@ -91,7 +91,7 @@ def test_profiles_end_where_those_of_the_full_model_do(inversion, poor, on_poor,
 
 def test_an_expansion_that_bends_as_no_basis_does_stays(inversion, poor, expansion, bounds):
     before = posterior_of(poor, inversion.minimum)
-    assert exact_at_ends(before, poor.under([expansion]), bounds) is before
+    assert exact_at_ends(before, poor.with_approximations([expansion]), bounds) is before
 
 
 def test_nothing_is_asked_where_no_minimum_was_found(inversion, poor, bounds):

@@ -100,7 +100,7 @@ def test_a_force_changes_with_poissons_ratio_as_differences_say(twin, dilatation
         there = model.solve(twin.moduli, twin.coefficients)
         reaction = surface_reaction(model.space, triangles, direction, law_named("linear"), dilatation=dilatation)
         term = Force("force", *stated_noise(0.01, 1), reaction, direction, 0.0)
-        seen = term.under(twin.moduli, np.zeros(0)).residuals(there.values[term.dofs])
+        seen = term.with_material(twin.moduli, np.zeros(0)).residuals(there.values[term.dofs])
         return term, there, seen
 
     term, there, seen = pulled(0.4)
@@ -124,7 +124,9 @@ def test_both_laws_say_the_same_of_poissons_ratio_in_a_small_motion(twin):
 
 
 def test_what_is_not_changed_moves_nothing(path, found):
-    still = path.under(tuple(np.zeros(len(line.residuals.values)) for line in found.minimum.evaluation.linearisations))
+    still = path.shifted_by(
+        tuple(np.zeros(len(line.residuals.values)) for line in found.minimum.evaluation.linearisations)
+    )
     assert still.converged
     assert not still.at_bound.any()
     assert still.theta == pytest.approx(0.0, abs=1e-4)
@@ -134,7 +136,7 @@ def test_another_poissons_ratio_of_all_moves_the_estimate_as_foretold(twins, twi
     minimum = found.minimum
     there = exact_equilibria(found.objective, minimum.unknowns)
     errors = poisson_errors(minimum.evaluation, there, Dilatation.POINTWISE)
-    foretold = path.under(tuple(0.01 * error.sum(axis=1) for error in errors)).theta
+    foretold = path.shifted_by(tuple(0.01 * error.sum(axis=1) for error in errors)).theta
     exact = moved(twins, found, model=with_poisson(twin, dict.fromkeys(("gland", "sac", "rest"), 0.46)))
     assert np.abs(exact).max() > 0.05
     assert foretold == pytest.approx(exact, abs=0.2 * np.abs(exact).max())
@@ -156,7 +158,7 @@ def test_a_step_to_another_law_ends_at_its_equilibrium(found):
 def test_a_known_modulus_moves_all_others_in_proportion(found, path):
     """Nothing but displacements is prescribed: what is known sets the scale alone, and the fast path knows it."""
     errors = modulus_errors(found.objective, found.minimum.unknowns, found.minimum.evaluation)
-    shift = path.under(tuple(np.log(1.1) * error[:, 2] for error in errors))
+    shift = path.shifted_by(tuple(np.log(1.1) * error[:, 2] for error in errors))
     assert shift.theta == pytest.approx(np.log([1.1, 1.1]), abs=0.01)
 
 
@@ -167,7 +169,7 @@ def test_a_surface_drawn_elsewhere_moves_the_estimate_as_foretold(twins, found, 
     A gland drawn larger by a quarter voxel is explained best by one as soft as can be: both end at the bound.
     """
     growth, minimum = VOXEL * voxels, found.minimum
-    foretold = path.under(tuple(growth * error for error in surface_errors(minimum.evaluation, tissue)))
+    foretold = path.shifted_by(tuple(growth * error for error in surface_errors(minimum.evaluation, tissue)))
 
     def grown(observation):
         before, after = observation.target.voxels
@@ -218,5 +220,5 @@ def test_modes_that_are_dropped_are_as_if_they_had_never_been(twins, found, monk
 def test_a_refit_that_never_settles_is_no_estimate(found, path):
     """An organ that is drawn half a millimetre larger, and one pass where several are needed."""
     errors = tuple(0.5 * by for by in surface_errors(found.minimum.evaluation, "gland"))
-    assert path.under(errors).converged
-    assert not path.under(errors, passes=1).converged
+    assert path.shifted_by(errors).converged
+    assert not path.shifted_by(errors, passes=1).converged

@@ -136,7 +136,7 @@ def at_finite_strain(near: Searched, *, progress: Progress) -> Searched:
         coarse = coarse_equilibrium(state.finite_strain, basis, point)
         expansions.append(expansion_around(coarse, tolerance=EQUILIBRIUM, progress=progress))
         states.append(replace(state, approximation=None, bending=basis))
-    objective = replace(before, states=tuple(states)).under(expansions)
+    objective = replace(before, states=tuple(states)).with_approximations(expansions)
     there = begun(objective, at.unknowns, history=at.history, evaluations=at.evaluations)
     return replace(there, mixture=near.mixture, group=near.group)
 

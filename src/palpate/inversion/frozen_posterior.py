@@ -70,14 +70,14 @@ class FixedCorrespondence:
                 drawn[:n_dofs] += there.values[rows] - before
                 moved = np.concatenate([drawn, material])
                 values = term.residuals.values + term.jacobian.by_displacement @ moved
-                jacobian = term.jacobian.under(tangent[rows])
+                jacobian = term.jacobian.with_tangent(tangent[rows])
                 residuals = replace(term.residuals, values=values)
                 found.append(Linearisation.of(term.observation, s, residuals, term.columns, jacobian, term.weights))
         return self.assembled(unknowns, found)
 
-    def believing(self, parameters: ParameterMap) -> FixedCorrespondence:
+    def with_prior(self, parameters: ParameterMap) -> FixedCorrespondence:
         """The same under another prior of its unknowns."""
-        return replace(self, objective=self.objective.believing(parameters))
+        return replace(self, objective=self.objective.with_prior(parameters))
 
     def assembled(self, unknowns: NDArray[np.float64], linearisations: Sequence[Linearisation]) -> Evaluation:
         """J at `unknowns` (n_unknowns,) where its linearisations there are known."""
@@ -243,7 +243,7 @@ class FrozenPosterior:
         """Number of log-moduli among the unknowns."""
         return self.parameters.n_parameters
 
-    def believing(self, parameters: ParameterMap) -> FrozenPosterior:
+    def with_prior(self, parameters: ParameterMap) -> FrozenPosterior:
         """The same under another prior of its unknowns."""
         return replace(self, parameters=parameters)
 
@@ -382,7 +382,7 @@ class Posterior(LeastSquares, Protocol):
         """The unknowns with their prior."""
         ...
 
-    def believing(self, parameters: ParameterMap) -> Posterior:
+    def with_prior(self, parameters: ParameterMap) -> Posterior:
         """The same under another prior of its unknowns."""
         ...
 

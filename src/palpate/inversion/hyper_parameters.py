@@ -143,7 +143,7 @@ def with_amplitudes(objective: Objective, evaluation: Evaluation, unknowns: NDAr
                 variances = evident_variances(terms, information, of_own)
                 covariance = np.tensordot(variances, np.stack(terms), axes=1)
             learned = Alternative(np.asarray(covariance), variances=tuple(variances.tolist()))
-            objective = objective.believing(parameters.believing({i: learned}))
+            objective = objective.with_prior(parameters.with_priors({i: learned}))
     return objective
 
 

@@ -55,7 +55,7 @@ class MarginalPosterior:
     def of(cls, posterior: Posterior) -> MarginalPosterior:
         """That of a posterior, under its own prior."""
         parameters = replace(posterior.parameters, volume=None)
-        return cls(posterior.believing(parameters), parameters.free_on_moduli)
+        return cls(posterior.with_prior(parameters), parameters.free_on_moduli)
 
     @property
     def n_parameters(self) -> int:
@@ -142,10 +142,10 @@ class Nearby:
         evaluations = (*self.evaluations, *mapped(marginal.objective, along))
         return replace(self, places=np.concatenate([self.places, along]), evaluations=evaluations)
 
-    def under(self, parameters: ParameterMap) -> Nearby:
+    def with_prior(self, parameters: ParameterMap) -> Nearby:
         """The same under another prior of the unknowns."""
         pairs = zip(self.places, self.evaluations, strict=True)
-        return replace(self, evaluations=tuple(seen.under(parameters, place) for place, seen in pairs))
+        return replace(self, evaluations=tuple(seen.with_prior(parameters, place) for place, seen in pairs))
 
     def parabola(self) -> Parabola:
         """M around the place."""

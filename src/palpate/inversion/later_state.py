@@ -94,8 +94,8 @@ class LaterState:
             combined, material = like.constraint.modes, like.material
         constraint = replace(self.model.constraint, modes=combined)
         conditions = replace(self.model.conditions, constraint=constraint)
-        finite = self.finite_strain and replace(self.finite_strain.under(conditions), material=material)
-        model = replace((like or self.model).under(conditions), material=material)
+        finite = self.finite_strain and replace(self.finite_strain.with_conditions(conditions), material=material)
+        model = replace((like or self.model).with_conditions(conditions), material=material)
         seen = tuple(o.combined(fields) if isinstance(o, OfMaterial) else o for o in self.observations)
         drawn = {name: modes @ at_rest[name] for name, modes in self.at_rest.items()}
         return replace(self, model=model, observations=seen, finite_strain=finite, at_rest=drawn)

@@ -245,7 +245,7 @@ def _laplace(
     posterior: Posterior, bounds: Bounds, of: _Compared, begin: NDArray[np.float64], places: int
 ) -> _Laplace | None:
     """An explanation, its minimum sought from unknowns (n_unknowns,); None where the model cannot be solved there."""
-    own = posterior.believing(posterior.parameters.choosing(dict(of.chosen)))
+    own = posterior.with_prior(posterior.parameters.choosing(dict(of.chosen)))
     try:
         found, nearby = MarginalPosterior.of(own).seen_at_minimum(begin, bounds, places)
     except SolverError:
@@ -256,13 +256,13 @@ def _laplace(
 def _laplace_beside(posterior: Posterior, bounds: Bounds, of: _Compared, leads: _Laplace) -> _Laplace | None:
     """An explanation with what is known around the minimum of another one; None where its own is too far from there."""
     own = replace(posterior.parameters.choosing(dict(of.chosen)), volume=None)
-    nearby = leads.nearby.under(own)
+    nearby = leads.nearby.with_prior(own)
     parabola = nearby.parabola()
     target, away = parabola.minimum(bounds)
     if away > BESIDE:
         return None
     try:
-        found = nearby.at_minimum(MarginalPosterior.of(posterior.believing(own)), target, parabola, Outcome.CONVERGED)
+        found = nearby.at_minimum(MarginalPosterior.of(posterior.with_prior(own)), target, parabola, Outcome.CONVERGED)
     except SolverError:
         return None
     return _levelled(own, bounds, of, found, nearby)

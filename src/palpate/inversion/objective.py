@@ -114,7 +114,7 @@ class Evaluation:
         found[numbers, numbers] = np.inf
         return found
 
-    def under(self, parameters: ParameterMap, unknowns: NDArray[np.float64]) -> Evaluation:
+    def with_prior(self, parameters: ParameterMap, unknowns: NDArray[np.float64]) -> Evaluation:
         """The same at `unknowns` (n_unknowns,), where it is of, under another prior of these."""
         value, pull = parameters.prior(unknowns)
         prior = parameters.prior_matrix
@@ -184,7 +184,7 @@ class Objective:
             points.append(LinearisationPoint(moduli, q, chain @ directions[own], metric, all_material))
         return points
 
-    def under(self, approximations: Sequence[Approximation]) -> Objective:
+    def with_approximations(self, approximations: Sequence[Approximation]) -> Objective:
         """The same observations and weights with other approximations, one for each state."""
         pairs = zip(self.states, approximations, strict=True)
         return replace(self, states=tuple(state.with_approximation(model) for state, model in pairs))
@@ -195,7 +195,7 @@ class Objective:
         states = [replace(s, bending=model) if s.bending else s.with_approximation(model) for s, model in pairs]
         return replace(self, states=tuple(states))
 
-    def believing(self, parameters: ParameterMap) -> Objective:
+    def with_prior(self, parameters: ParameterMap) -> Objective:
         """The same under another prior of its unknowns."""
         return replace(self, parameters=parameters)
 
@@ -278,7 +278,7 @@ class Objective:
         def seen(of: tuple[tuple[Observation, NDArray[np.float64]], float]) -> tuple[Observation, Residuals]:
             """One observation with its residuals."""
             (observation, motion), offset = of
-            here = observation.under(*material) if isinstance(observation, OfMaterial) else observation
+            here = observation.with_material(*material) if isinstance(observation, OfMaterial) else observation
             return observation, here.residuals(motion, offset)
 
         return mapped(seen, zip(self._seen(s, values, unknowns), self._offsets(s, unknowns), strict=True))

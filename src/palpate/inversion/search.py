@@ -102,7 +102,7 @@ class Searched:
         for approximation, point in zip(self.objective.approximations, points, strict=True):
             assert isinstance(approximation, Expansion)
             exact.append(approximation.at_equilibrium(point, tolerance=ACCURACY))
-        objective = self.objective.under(exact)
+        objective = self.objective.with_approximations(exact)
         minimum = replace(at, evaluation=objective(at.unknowns), evaluations=at.evaluations + 1)
         return replace(self, objective=objective, minimum=minimum)
 
@@ -214,7 +214,7 @@ def _rivals(now: Searched, bounds: Bounds) -> Iterator[Searched]:
         if of.level > now.posterior.level - RIVAL and of.group not in found:
             found.add(of.group)
             own = Mixture(tuple(other for other in seen.explanations if other.group == of.group))
-            objective = now.objective.believing(of.prior(now.objective.parameters))
+            objective = now.objective.with_prior(of.prior(now.objective.parameters))
             before = replace(now, objective=objective, mixture=own, group=of.group, moved=np.inf)
             yield _taken(before, at.evaluation, of.minimum.unknowns)
 
@@ -227,7 +227,7 @@ def likely_minima(now: Searched, begins: Sequence[NDArray[np.float64]], bounds: 
     if now.frozen is None or not begins:
         return []
     n, likeliest = now.objective.n_parameters, now.posterior.explanations[0]
-    own = MarginalPosterior.of(now.frozen.believing(likeliest.prior(now.frozen.parameters)))
+    own = MarginalPosterior.of(now.frozen.with_prior(likeliest.prior(now.frozen.parameters)))
 
     def of(begin: NDArray[np.float64]) -> MarginalMinimum | None:
         """That which is found from there; None where the model cannot be solved."""
@@ -246,10 +246,10 @@ def _ended(now: Searched, mixture: Mixture, bounds: Bounds) -> Searched:
     """The search where it ends: at the mean of the mixture, all else at its best under the likeliest explanation."""
     at, objective = now.minimum, now.objective
     assert now.frozen is not None, "a search has come to its end"
-    objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
+    objective = objective.with_prior(mixture.explanations[0].prior(objective.parameters))
     theta = np.clip(mixture.mean, bounds.lower, bounds.upper)
     start = np.concatenate([theta, mixture.minimum.unknowns[len(theta) :]])
-    own, held = now.frozen.believing(objective.parameters), Bounds(theta, theta)
+    own, held = now.frozen.with_prior(objective.parameters), Bounds(theta, theta)
     target = gauss_newton(own, start, bounds=held, tolerance=NEAR).unknowns
     there = _taken(replace(now, objective=objective, mixture=mixture), at.evaluation, target)
     before = at.history[:-1] if np.array_equal(at.history[-1].theta, theta) else at.history  # no place stands twice
@@ -287,7 +287,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
     exact = now.moved < 1.0
     own = Candidates(kept) if exact else Candidates(kept, FAR_MOST, places=FAR_PLACES)
     mixture = mixture_of(posterior, at.unknowns, evaluation, near, own, begins=begins, earlier=now.mixture)
-    objective = objective.believing(mixture.explanations[0].prior(objective.parameters))
+    objective = objective.with_prior(mixture.explanations[0].prior(objective.parameters))
     sd = np.maximum(mixture.sd, FLOOR / rule.step_sd)
     moved = float(np.max(np.abs(mixture.mean - theta) / sd, initial=0.0))
     near_end = now.moved < LAST_FIT or (exact and now.fits >= PATIENCE)
@@ -305,7 +305,7 @@ def _iteration(now: Searched, bounds: Bounds, rule: StopRule, begins: Sequence[N
         frozen=posterior,
     )
     if now.group is not None and exact and (settled or rule.step_sd >= LAST_FIT) and moved < rule.step_sd:
-        evaluation = evaluation.under(objective.parameters, at.unknowns)
+        evaluation = evaluation.with_prior(objective.parameters, at.unknowns)
         minimum = replace(at, evaluation=evaluation, outcome=Outcome.CONVERGED)
         return replace(before, minimum=minimum, settled=True)
     target = np.concatenate([np.clip(mixture.mean, near.lower, near.upper), mixture.mean_unknowns[n:]])
@@ -346,7 +346,7 @@ def _taken(now: Searched, evaluation: Evaluation, target: NDArray[np.float64]) -
     """The search at a target (n_unknowns,), or nearer where its state cannot be solved."""
     at, objective = now.minimum, now.objective
     failure: EstimationError = SolverError("no step was tried")
-    believed = evaluation.under(objective.parameters, at.unknowns)
+    believed = evaluation.with_prior(objective.parameters, at.unknowns)
     for _ in range(HALVINGS):
         try:
             there = _exact(objective, believed, target, near=now.settled or now.moved < 1.0)
@@ -370,7 +370,7 @@ def _exact(objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.fl
     for i, block in enumerate(objective.parameters.blocks):
         if block.choice.of_tissues:
             wide[i] = len(block.alternatives) - 1
-    other = evaluation.under(objective.parameters.choosing(wide), unknowns)
+    other = evaluation.with_prior(objective.parameters.choosing(wide), unknowns)
     both = [evaluation, other] if wide else [evaluation]
     points = objective.linearisation_points(unknowns, both, all_material=near)
-    return objective.under(updated(objective.approximations, points)).rematched(unknowns)
+    return objective.with_approximations(updated(objective.approximations, points)).rematched(unknowns)

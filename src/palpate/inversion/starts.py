@@ -149,7 +149,7 @@ def _on_bases(
     ) -> LaterState:
         """A state on its basis."""
         (state, responses, projected, material), q = of
-        own = projected if projected.model is state.model else projected.under(state.model)
+        own = projected if projected.model is state.model else projected.with_model(state.model)
         basis = responses.basis(own, material).with_modulus_series(q, seen.derivatives(unknowns))
         return state.with_approximation(basis)
 

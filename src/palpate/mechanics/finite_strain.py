@@ -170,7 +170,7 @@ class FiniteStrainModel:
             tissue=np.array(self.regions)[self.element_region],
         )
 
-    def under(self, conditions: Conditions) -> FiniteStrainModel:
+    def with_conditions(self, conditions: Conditions) -> FiniteStrainModel:
         """The same body with other loads, modes and offset of the same prescribed points.
 
         Raises `ConfigurationError` when the conditions leave other displacements free.

@@ -72,7 +72,7 @@ class LinearModel:
         """What is prescribed."""
         return self.conditions.constraint
 
-    def under(self, conditions: Conditions) -> LinearModel:
+    def with_conditions(self, conditions: Conditions) -> LinearModel:
         """The same body with other loads, modes and offset of the same prescribed points; nothing is assembled again.
 
         Raises `ConfigurationError` when the conditions leave other displacements free than the model's own.
@@ -432,7 +432,7 @@ def linear_model(
     stiffness, free_stiffness = zip(*mapped(assembled, regions), strict=True)
     elements = elements_of(space, LINEAR, dilatation) if material.n_modes else None
     model = LinearModel(space, conditions, regions, stiffness, free_stiffness, (), solver, elements, material)
-    return model.under(conditions)
+    return model.with_conditions(conditions)
 
 
 def touched_rows(matrix: sparse.csr_matrix[np.float64]) -> tuple[NDArray[np.int64], sparse.csr_matrix[np.float64]]:

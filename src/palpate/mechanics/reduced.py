@@ -320,7 +320,7 @@ class Projection:
         )
         return replace(self, reduced=reduced)
 
-    def under(self, model: LinearModel) -> Projection:
+    def with_model(self, model: LinearModel) -> Projection:
         """The projection of another state of the body, whose modes are the same, on the same vectors in memory.
 
         Not at the displacement of this state: material modes move nothing.

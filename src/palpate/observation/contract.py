@@ -235,7 +235,7 @@ class Rematched(Protocol):
 class OfMaterial(Protocol):
     """An observation that depends on the moduli directly, not through the displacement alone, as a force does."""
 
-    def under(self, moduli: NDArray[np.float64], material: NDArray[np.float64]) -> Self:
+    def with_material(self, moduli: NDArray[np.float64], material: NDArray[np.float64]) -> Self:
         """The same at moduli (n_regions,) kPa and coefficients (n_material,) of the material modes."""
         ...
 

@@ -38,7 +38,7 @@ class Force(StatedNoise):
         """Numbers (n_dofs,) of the unknowns of the elements at the surface."""
         return self.reaction.dofs
 
-    def under(self, moduli: NDArray[np.float64], material: NDArray[np.float64]) -> Force:
+    def with_material(self, moduli: NDArray[np.float64], material: NDArray[np.float64]) -> Force:
         """The same at moduli (n_regions,) kPa and coefficients (n_material,) of the material."""
         return replace(self, at=(moduli, material))
 

@@ -78,7 +78,7 @@ class Jacobian:
         """The same of some of the residuals."""
         return replace(self, by_displacement=sparse.csr_matrix(self.by_displacement[rows]))
 
-    def under(self, tangent: NDArray[np.float64]) -> Jacobian:
+    def with_tangent(self, tangent: NDArray[np.float64]) -> Jacobian:
         """The same with other derivatives of the displacements (n_dofs, k) by the first k unknowns."""
         whole = self.tangent.copy()
         whole[: len(tangent), : tangent.shape[1]] = tangent

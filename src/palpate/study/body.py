@@ -295,7 +295,7 @@ def _models(body: Body, case: Case) -> list[tuple[LinearModel, PrescribedMotion]
             model, motion = models[0]
             motion = replace(motion, offset=bone_offset(body.space, later.bones))
             constraint = replace(model.constraint, offset=motion.offset)
-            models.append((model.under(Conditions(constraint, loads)), motion))
+            models.append((model.with_conditions(Conditions(constraint, loads)), motion))
             continue
         motion = prescribed_motion(
             body.space,
@@ -356,7 +356,7 @@ def _finite_strain(
         space, conditions = model.space, model.conditions
         like = next((other for other in found if other.space is space), None)
         if like:
-            found.append(like.under(conditions))
+            found.append(like.with_conditions(conditions))
             continue
         loads, material = conditions.loads, model.material
         found.append(

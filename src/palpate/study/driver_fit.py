@@ -49,7 +49,7 @@ def fit_driver(
         states, offset = list[NDArray[np.float64]](), near.model.constraint.offset
         for share in shares:  # each from the one before it
             constraint = replace(near.model.constraint, offset=share * offset)
-            model = near.model.under(replace(near.model.conditions, constraint=constraint))
+            model = near.model.with_conditions(replace(near.model.conditions, constraint=constraint))
             start = states[-1] if states else share * near.displacement
             states.append(model.solve(near.moduli, share * q, start=start).displacement)
         found.append(tuple(states))
@@ -61,7 +61,7 @@ def _fitted(
 ) -> list[NDArray[np.float64]]:
     """Driver coefficients of each state that bring the walls to the images, from given ones, all in one row."""
     still = np.zeros(objective.n_parameters)
-    objective = objective.under(models).with_observations(
+    objective = objective.with_approximations(models).with_observations(
         [o.with_noise(SEGMENTATION_NOISE) for o in objective.observations]
     )
     first = fit_coefficients(objective, np.concatenate([still, coefficients]))

@@ -125,8 +125,8 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
     believed = {Choice.LAYERS: 1, Choice.DRAWING: 0}  # free, and drawn alike
     blocks = objective.parameters.blocks
     chosen = {i: believed[block.choice] for i, block in enumerate(blocks) if block.choice in believed}
-    free = objective.believing(objective.parameters.choosing(chosen))
-    found = covariance_of(free, fitted.evaluation.under(free.parameters, fitted.unknowns), (), noise_of=noise_of)
+    free = objective.with_prior(objective.parameters.choosing(chosen))
+    found = covariance_of(free, fitted.evaluation.with_prior(free.parameters, fitted.unknowns), (), noise_of=noise_of)
     surfaces = [noise for (_, kind), noise in noise_of.items() if kind == "surface distance"]
     noise = surfaces[0] if surfaces else next(iter(noise_of.values()))
     mapping, moduli = objective.parameters, list[PredictedModulus]()

@@ -115,7 +115,7 @@ def fast_variations(
         """One input changed by one of its amounts."""
         each, amount, words = job
         errors = tuple(amount * error for error in each.errors)
-        return _stated(names, (each.cause, each.subject, words), partial(path.under, errors))
+        return _stated(names, (each.cause, each.subject, words), partial(path.shifted_by, errors))
 
     found = [
         *_exact(inversion, tissues),

@@ -78,7 +78,7 @@ class FastPath:
     least: Minimum
     bounds: Bounds
 
-    def under(self, errors: Errors, *, passes: int = PASSES) -> Shift:
+    def shifted_by(self, errors: Errors, *, passes: int = PASSES) -> Shift:
         """Where the estimate goes when the residuals of each observation change by e (n,) mm, noise, weights and all.
 
         passes: see `refitted`, which also tells what is raised.
@@ -119,7 +119,7 @@ class FastPath:
                 priors[i] = replace(priors[i], covariance=covariance)
             if dropped is not None:
                 start[n:] = np.where(dropped, 0.0, start[n:])
-            changed = changed.believing(replace(parameters, priors=tuple(priors)))
+            changed = changed.with_prior(replace(parameters, priors=tuple(priors)))
         near = _accelerated(changed, start, self.bounds)
         if near.converged:
             return self._shift(near)
@@ -256,7 +256,7 @@ def poisson_errors(
             found.append(moved)
             continue
         system = there if isinstance(there, FiniteStrainEquilibrium) else there.system
-        here = seen.under(system.moduli, there.coefficients[system.model.constraint.n_modes :])
+        here = seen.with_material(system.moduli, there.coefficients[system.model.constraint.n_modes :])
         found.append(moved + here.by_poisson(seen_by(seen, there.values)))
     return tuple(found)
 
@@ -291,7 +291,8 @@ def law_errors(
         made = finite_strain_model(first.model.space, first.model.constraint, law, dilatation=dilatation)
         of_states = [linear.pop(s) for s in alike]
         others = [
-            replace(made.under(of.system.model.conditions), material=of.system.model.material) for of in of_states
+            replace(made.with_conditions(of.system.model.conditions), material=of.system.model.material)
+            for of in of_states
         ]
         found = chord_equilibria(
             [

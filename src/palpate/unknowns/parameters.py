@@ -344,14 +344,14 @@ class ParameterMap:
     def _model_columns(self, state: int) -> NDArray[np.int64]:
         return np.concatenate([self.acting(Acts.BOUNDARY, state), self.acting(Acts.MATERIAL, state)])
 
-    def believing(self, priors: Mapping[int, Alternative]) -> ParameterMap:
+    def with_priors(self, priors: Mapping[int, Alternative]) -> ParameterMap:
         """The same with other priors of some blocks, by their numbers."""
         return replace(self, priors=tuple(priors.get(i, own) for i, own in enumerate(self.priors)))
 
     def choosing(self, chosen: Mapping[int, int]) -> ParameterMap:
         """The same with the alternative priors of blocks, by the numbers of both."""
         levels = tuple(chosen.get(i, own) for i, own in zip(self._of_tissues, self.levels, strict=True))
-        return replace(self.believing({i: self.blocks[i].alternatives[k] for i, k in chosen.items()}), levels=levels)
+        return replace(self.with_priors({i: self.blocks[i].alternatives[k] for i, k in chosen.items()}), levels=levels)
 
     def combined(self, inverses: Sequence[NDArray[np.float64]]) -> ParameterMap:
         """The map of combinations z = inverse x of each block's unknowns, inverse (k, n), as believed at first.

@@ -112,7 +112,7 @@ def estimate_patient(settings: CohortSettings, patient: int, progress: Callable[
     progress(f"patient {patient + 1}: {3 * len(space.points)} unknowns")
     basis = _basis(model)
     held = replace(model.constraint, modes=np.zeros((3 * len(space.points), 0)))
-    system = model.under(Conditions(held)).system(_moduli(model, truth))
+    system = model.with_conditions(Conditions(held)).system(_moduli(model, truth))
     pairs = [
         _Pair(settings, shapes, basis, system, np.random.default_rng([seed, number]))
         for number in range(settings.pairs[patient])
@@ -191,7 +191,7 @@ class _Pair:
         offset = np.zeros_like(model.space.points)
         wall = np.unique(model.space.facets(mesh.boundary[mesh.beyond == mesh.tissue_index("rectum")]))
         offset[wall] = motion.at(model.space.points[wall])
-        filled = model.under(Conditions(replace(model.constraint, offset=offset.ravel())))
+        filled = model.with_conditions(Conditions(replace(model.constraint, offset=offset.ravel())))
         return replace(self.system, model=filled).solve(np.zeros(0)).displacement
 
 

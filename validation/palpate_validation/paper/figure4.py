@@ -212,7 +212,7 @@ class _Bench:
         blocks = unit_blocks(self.linear.n_modes)
         mapping = parameter_map(balls_tissues(moduli), self.linear.regions, blocks, loaded=True)
         settings = from_half(mapping, dict(zip(BODIES, moduli, strict=True)))
-        model = self.linear.under(Conditions(self.constraint, (load,)))
+        model = self.linear.with_conditions(Conditions(self.constraint, (load,)))
         finite = finite_strain_model(
             self.space, self.constraint, law, loads=(load,), settings=NewtonSettings(tolerance=ACCURACY)
         )

@@ -224,7 +224,7 @@ class _Case:
             terms = np.column_stack([np.ones(NEAREST), away[near]])
             offset[dof] = np.linalg.lstsq(terms, u[near, dof % 3], rcond=None)[0][0]
         held = replace(own.constraint, modes=np.zeros((len(offset), 0)), offset=offset)
-        model = own.under(Conditions(held, (pulled(own.space, self.stress_kpa),)))
+        model = own.with_conditions(Conditions(held, (pulled(own.space, self.stress_kpa),)))
         return entries_by_the_paper(model, truth.space, u, self.truth, moduli=0.5 * np.array(self.moduli))
 
 
@@ -234,4 +234,4 @@ def _model(space: LagrangeSpace) -> LinearModel:
 
 def _pulled_by(model: LinearModel, stress_kpa: float) -> LinearModel:
     """The model with a pull of `stress_kpa` instead of 1 kPa."""
-    return model.under(Conditions(model.constraint, (pulled(model.space, stress_kpa),)))
+    return model.with_conditions(Conditions(model.constraint, (pulled(model.space, stress_kpa),)))

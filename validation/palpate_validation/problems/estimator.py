@@ -60,7 +60,7 @@ def coverage(repeats: int, seed: int) -> Array:
     for _ in range(repeats):
         noise = smooth_field(rng, sd_mm=NOISE_SD, correlation_mm=NOISE_LENGTH, features=200)
         problem = twin_problem(model, noise, stated_noise=stated)
-        objective = with_first_noise(Objective(problem.states, problem.parameters).under([approximation]))
+        objective = with_first_noise(Objective(problem.states, problem.parameters).with_approximations([approximation]))
         unknowns = start
         for _ in range(PASSES):
             objective = objective.rematched(unknowns)
