@@ -128,10 +128,10 @@ def _failure(end: _End, limits: Limits, said: str) -> tuple[str, str]:
     """Class and sentence of a failure; said: the last complaint on standard error. Raises `RowLostError`."""
     memory_gb = limits.memory_gb or float("inf")
     if end.stopped == "time":
-        return "timeout", f"it took more than the {limits.seconds:g} s that it was given; --time-limit gives more"
+        return "timeout", f"it took more than the {limits.seconds:g} s that it was given (--time-limit)"
     if end.stopped == "memory":
-        advice = "--memory-limit gives more, and fewer --workers leave more to each"
-        return "resources", f"it took more than the {memory_gb:.1f} GB of memory that it was given; {advice}"
+        advice = "set --memory-limit, or take fewer --workers, which leave more to each"
+        return "resources", f"it took more than the {memory_gb:.1f} GB of memory that it was given: {advice}"
     if end.code == -signal.SIGKILL and end.peak_gb > MUCH * memory_gb:
         return "resources", f"the system ended it at {end.peak_gb:.1f} GB of memory, most likely for want of more"
     if end.code in FROM_OUTSIDE:
