@@ -21,7 +21,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -55,11 +54,8 @@ def write_data(folder: Path, count: int) -> Rows:
         for name, image in (("before", scene.before), ("after", scene.after)):
             write_label_image(folder / f"{name}_{body}.nii.gz", image)
     (folder / "template.toml").write_text(TEMPLATE)
-    rows = []
-    for k in range(count):
-        who = {"id": f"r{k}", "patient": f"P{k // 2}", "stage": str(1 + k // 2 % 3)}
-        rows.append(who | {"before": f"before_{k % 3}.nii.gz", "after": f"after_{k % 3}.nii.gz"})
-    return rows
+    who = [{"id": f"r{k}", "patient": f"P{k // 2}", "stage": str(1 + k // 2 % 3)} for k in range(count)]
+    return [row | {name: f"{name}_{k % 3}.nii.gz" for name in ("before", "after")} for k, row in enumerate(who)]
 
 
 def spoil(rows: Rows, folder: Path) -> None:
@@ -148,7 +144,7 @@ if __name__ == "__main__":
     parser.add_argument("--runs", type=int, default=8)
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
-        parts = {"kills": partial(kills, runs=asked.runs), "bad": bad, "speed": speed}
-        told = parts[asked.part](write_data(Path(place), asked.rows), Path(place))
+        given = write_data(Path(place), asked.rows), Path(place)
+        told = {"bad": bad, "speed": speed}[asked.part](*given) if asked.part != "kills" else kills(*given, asked.runs)
     print(json.dumps({"rows": asked.rows} | told, indent=1))
     raise SystemExit(0 if told["as_it_should_be"] else 1)

@@ -280,6 +280,7 @@ def test_what_a_run_has_started_ends_with_it(rows_that, tmp_path, number):
 def test_rows_on_another_cluster_end_with_the_run_and_a_run_with_its_scheduler(rows_that, tmp_path):
     rows_that()
     options = {"n_workers": 1, "threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": None}
+    options["scheduler_kwargs"] = {"dashboard_address": "127.0.0.1:0"}
     with import_module("distributed").LocalCluster(**options, silence_logs=50) as cluster:
         client, row = start_client(tmp_path, cluster.scheduler_address)
         client.kill()

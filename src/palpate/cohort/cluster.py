@@ -69,7 +69,8 @@ def _local_cluster(distributed: Any, workers: int) -> Any:
             threads_per_worker=1,
             memory_limit="auto" if memory is None else int(memory / workers),
             host=LOOPBACK,
-            dashboard_address=None,
+            dashboard_address=None,  # no dashboard; what tells of the scheduler's health takes any free port
+            scheduler_kwargs={"dashboard_address": f"{LOOPBACK}:0"},
             silence_logs=QUIET,
         )
     except (OSError, RuntimeError) as error:
