@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -45,14 +45,12 @@ def estimate(
     *,
     progress: Progress = silent,
     truth: Mapping[str, float] | None = None,
-    condition: Callable[[ExpectedCost], None] | None = None,
     added: Added | None = None,
 ) -> CaseResult:
     """Estimate the Young's modulus of every `estimate` tissue of a case, from its images or its phantom.
 
     `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own;
-    `condition`: is asked with what is expected to be taken, once the images are read, and may raise; `added`: to which
-    earlier estimate the case's later images are added.
+    `added`: to which earlier estimate the case's later images are added.
     Raises `ResourceError` where this machine has not the memory, `PalpateError`s of reading, meshing and solving; an
     iteration that did not converge is no error but a result whose status says so, with no values.
     """
@@ -66,8 +64,6 @@ def estimate(
     states, *further = images.pairs
     cost = expected_cost(case, states.before, states.after, n_pairs=len(images.pairs), mesh=states.mesh)
     refuse_lack(cost)
-    if condition is not None:
-        condition(cost)
     progress(_forecast(cost))
     if case.phantom:
         stated = [(t.name, t.youngs_modulus_kpa) for t in states.before.tissues if t.role is Role.ESTIMATE]
