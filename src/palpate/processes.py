@@ -12,14 +12,6 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-try:
-    import resource
-except ImportError:  # Windows
-    TOLD = False
-else:
-    TOLD = True
-
-
 STATED = "PALPATE_MEMORY_GB"  # environment variable: memory for this program where others share the machine
 MACHINE = Path("/proc/meminfo")
 Groups = tuple[tuple[str, str, str], ...]
@@ -44,14 +36,6 @@ def available_memory(groups: Groups = CGROUPS, machine: Path = MACHINE) -> float
             left = float(Path(limit).read_text(encoding="ascii")) - float(Path(use).read_text(encoding="ascii"))
             found.append(left + given_back)
     return min((amount for amount in found if amount is not None), default=None)
-
-
-def peak_memory_gb() -> float | None:
-    """The most memory (GB) that this process has held; None where the system does not say."""
-    if not TOLD:
-        return None
-    unit = 1 if sys.platform == "darwin" else 1024
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9, 3)
 
 
 def total_memory(groups: Groups = CGROUPS, machine: Path = MACHINE) -> float | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from palpate.cli.outcome import Outcome, columns
@@ -14,7 +15,6 @@ from palpate.progress import Line, Progress, counted
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from palpate.cohort.engines.packing import Engine
     from palpate.cohort.records import Record
     from palpate.study.outputs import OutputFolder
 
@@ -25,25 +25,21 @@ MOST_NAMED = 5  # rows that are left out for one reason
 TARGETS = ("cohort.csv", "cohort.parquet", "cohort.html", "statistics.json", "plan.json")
 
 
-def cohort(arguments: argparse.Namespace, _: None, outputs: OutputFolder | None, progress: Progress) -> Outcome:
-    """Compute the rows of a table, or a part of them that SLURM asks for."""
-    from palpate.cohort.tables import require_tables
+def cohort(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progress: Progress) -> Outcome:
+    """Compute the rows of a table, or every n-th of them, on workers of Dask."""
+    from palpate.cohort.tables import require_libraries
 
-    if arguments.task is not None:
-        from palpate.cohort.engines.slurm import run_part
-
-        outcomes = [outcome.to_dict() for outcome in run_part(arguments.output, arguments.task, progress)]
-        return Outcome({"schema": "palpate.task/1", "outcomes": outcomes}, f"{len(outcomes)} rows computed")
-    require_tables()
+    require_libraries("distributed")
+    from palpate.cohort.cluster import outcomes
     from palpate.cohort.run import Options, run_cohort
     from palpate.cohort.table import read_derivatives, read_table
     from palpate.cohort.task import Limits
     from palpate.images.input_file import like
+    from palpate.parallel import processors
 
-    assert outputs is not None
     table, template = arguments.table, arguments.template
-    if table is None:
-        raise ConfigurationError("name the cohort's table: palpate cohort cohort.csv --output DIR")
+    if arguments.scheduler is not None and arguments.workers is not None:
+        raise ConfigurationError("--workers goes without --scheduler, whose cluster has workers of its own")
     if template is not None and not template.is_file():
         raise ConfigurationError(f"there is no template {template}{like(template) or '; give the path of a case.toml'}")
     if table.is_dir():
@@ -52,21 +48,23 @@ def cohort(arguments: argparse.Namespace, _: None, outputs: OutputFolder | None,
         raise ConfigurationError("--reference goes with BIDS derivatives; in a table, 'before' names the rest state")
     else:
         rows = read_table(table, template)
-    engine = _engine(arguments, outputs.path)
+    workers = min(arguments.workers or processors(), len(rows))
     options = Options(
         overrides=tuple(arguments.set),
         limits=Limits(arguments.memory_limit, arguments.time_limit),
         resume=arguments.resume,
         only_failed=arguments.only_failed,
         overwrite=arguments.overwrite,
-        workers=arguments.workers,
+        shard=arguments.shard,
+        workers=None if arguments.scheduler else workers,
     )
+    compute = partial(outcomes, scheduler=arguments.scheduler, workers=workers)
     try:
-        records = run_cohort(rows, outputs.path, engine, options, progress=progress)
+        records = run_cohort(rows, outputs.path, compute, options, progress=progress)
     except KeyboardInterrupt:
         outputs.written.append(INTERRUPTED)
         raise
-    return _told(records, outputs.path)
+    return _told(records, outputs.path, arguments.shard)
 
 
 def status(arguments: argparse.Namespace, _: None, outputs: None, progress: Progress) -> Outcome:
@@ -80,62 +78,49 @@ def status(arguments: argparse.Namespace, _: None, outputs: None, progress: Prog
 
 def statistics(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Compute the statistics of a cohort from its files."""
-    from palpate.cohort.tables import require_tables
+    from palpate.cohort.tables import require_libraries
 
-    require_tables()
+    require_libraries()
     from palpate.cohort.plan import read_plan
-    from palpate.cohort.run import close_cohort
+    from palpate.cohort.records import records_of
+    from palpate.cohort.run import write_all
     from palpate.study.outputs import read_json
 
     del case
     plan = read_plan(outputs.path)
     progress(Line("computing the statistics"))
-    close_cohort(plan, outputs.path)
+    write_all(plan, records_of(plan, outputs.path), outputs.path)
     document = read_json(outputs.path / "statistics.json")
     files = f"written to {outputs.path}: {', '.join(TARGETS[:-1])}"
     opening = f"open {outputs.path / 'cohort.html'}"
     return Outcome(document, "\n".join([_associations(document), *left_out_rows(document), files, opening]))
 
 
-def _engine(arguments: argparse.Namespace, folder: Path) -> Engine:
-    if arguments.scheduler is not None and arguments.engine != "dask":
-        raise ConfigurationError("--scheduler goes with --engine dask")
-    if arguments.engine == "dask":
-        from palpate.cohort.engines.dask import DaskEngine
-
-        return DaskEngine(arguments.scheduler, arguments.workers)
-    if arguments.engine == "slurm":
-        from palpate.cohort.engines.slurm import SlurmEngine
-
-        return SlurmEngine(folder, arguments.workers)
-    from palpate.cohort.engines.local import LocalEngine
-
-    return LocalEngine(arguments.workers)
-
-
-def _told(records: Sequence[Record], folder: Path) -> Outcome:
-    """The outcome of the rows; an exit code above 0 when any of them is still waiting."""
+def _told(records: Sequence[Record], folder: Path, shard: tuple[int, int] | None) -> Outcome:
+    """The outcome of the rows; an exit code above 0 when any of them, or of the shard, is still waiting."""
     from palpate.study.outputs import read_json
 
     states = [record.state for record in records]
     counts = {state: states.count(state) for state in ("done", "failed", "waiting")}
     document: dict[str, Any] = {"schema": "palpate.cohort/1", "rows": len(records), **counts}
-    document["failures"] = [
-        {"id": record.row.id, "failure_class": record.failure_class, "message": record.message}
-        for record in records
-        if record.state == "failed"
-    ]
-    found = read_json(folder / "statistics.json")
-    document["statistics"] = found
     failed = [record for record in records if record.failure_class]
+    document["failures"] = [
+        {"id": record.row.id, "failure_class": record.failure_class, "message": record.message} for record in failed
+    ]
     lines = [f"{record.row.id} failed ({record.failure_class}): {record.message}" for record in failed[:MOST_TOLD]]
     if len(failed) > MOST_TOLD:
         lines.append(f"and {len(failed) - MOST_TOLD} more, see cohort.csv")
     summary = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
-    files = f"written to {folder}: {', '.join(TARGETS[:-1])}, cases/"
-    opening = f"open {folder / 'cohort.html'}"
-    text = "\n".join([*lines, _associations(found), *left_out_rows(found), summary, files, opening])
-    left = f"{counts['waiting']} rows are waiting: --resume goes on with them" if counts["waiting"] else ""
+    if shard is not None and counts["waiting"]:  # the run that finds no row waiting writes the tables
+        waits = "waiting" in states[shard[0] - 1 :: shard[1]]
+        text = "\n".join([*lines, f"{summary}; the tables follow when no row is waiting"])
+    else:
+        waits = bool(counts["waiting"])
+        found = document["statistics"] = read_json(folder / "statistics.json")
+        files = f"written to {folder}: {', '.join(TARGETS[:-1])}, cases/"
+        opening = f"open {folder / 'cohort.html'}"
+        text = "\n".join([*lines, _associations(found), *left_out_rows(found), summary, files, opening])
+    left = f"{counts['waiting']} rows are waiting: --resume goes on with them" if waits else ""
     return Outcome(document, text, ResourceError.exit_code if left else 0, left)
 
 

@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,7 @@ from palpate.cli.outcome import Outcome, printable_lines
 from palpate.cli.parser import make_parser, version
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
 from palpate.steps.streams import LOGGER, tell
-from palpate.study.outputs import OutputFolder
+from palpate.study.outputs import OutputFolder, make_folder
 
 # Heavy layers are imported by the sub-command that needs them, so that `palpate --help` answers at once.
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
     images = len(getattr(arguments, "inputs", ())) > 1  # in the place of a case
     path: Path | None = None if images else getattr(arguments, "inputs", [getattr(arguments, "case", None)])[0]
     case = None if path is None else read_case(path, arguments.set)
-    if arguments.output is None or getattr(arguments, "task", None) is not None:  # a task's folder is another run's
+    if arguments.output is None:
         with progress_on_stderr(quiet=arguments.quiet, verbose=arguments.verbose) as progress:
             return command(arguments, case, None, progress)
     if getattr(arguments, "add", ()):
@@ -123,9 +123,10 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
         advice = like(arguments.output) or "; name the output folder of an earlier run"
         raise InputDataError(f"there is no folder {arguments.output}{advice}")
     heading = f"palpate {version()}: {' '.join(sys.argv[1:])}"
+    shared = getattr(arguments, "shard", None) is not None  # with runs of other shards
     outputs = OutputFolder(arguments.output, written, getattr(arguments, "overwrite", False))
     with (
-        output_folder(outputs, heading, logs=arguments.logs),
+        nullcontext(make_folder(outputs.path)) if shared else output_folder(outputs, heading, logs=arguments.logs),
         progress_on_stderr(
             quiet=arguments.quiet,
             verbose=arguments.verbose,

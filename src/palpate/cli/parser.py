@@ -61,7 +61,7 @@ EXAMPLES = {
     ),
     "cohort": (
         "palpate cohort cohort.csv --template case.toml --output study",
-        "palpate cohort cohort.csv --output study --engine slurm --workers 20 --resume",
+        "palpate cohort cohort.csv --output study --scheduler tcp://10.0.0.5:8786 --resume",
     ),
     "status": ("palpate status study", "palpate status study --json"),
     "statistics": ("palpate statistics study", "palpate statistics study --json"),
@@ -243,28 +243,27 @@ def _add_cohort(subparsers: Any) -> None:
     command.add_argument(
         "table",
         type=Path,
-        nargs="?",
         metavar="COHORT",
         help="CSV file: id, patient, session, stage, and case or before and after; or a folder of BIDS derivatives",
     )
     command.add_argument("--template", type=Path, metavar="CASE.TOML", help="the case file that is used for all images")
-    command.add_argument("--engine", choices=("local", "dask", "slurm"), default="local", help="default: %(default)s")
-    command.add_argument("--scheduler", metavar="ADDRESS", help="address of a running Dask scheduler (--engine dask)")
-    command.add_argument("--workers", type=_count, metavar="N", help="cases at a time; default: one for each processor")
+    what = "processes of this machine, which take a row at a time each; default: one for each processor"
+    command.add_argument("--workers", type=_count, metavar="N", help=what)
+    what = "address of a running Dask scheduler, whose workers are used instead"
+    command.add_argument("--scheduler", metavar="ADDRESS", help=what)
+    what = "only every N-th row from the K-th; runs of other shards may work in the same output folder at the same time"
+    command.add_argument("--shard", type=_shard, metavar="K/N", help=what)
     command.add_argument("--resume", action="store_true", help="continue the cohort in the output folder")
     command.add_argument("--only-failed", action="store_true", help="in that cohort, compute the failed rows again")
     what = "compute all rows again; the output folder may have this or another cohort already"
     command.add_argument("--overwrite", action="store_true", help=what)
-    command.add_argument(
-        "--memory-limit", type=_positive, metavar="GB", help="for each case; default: twice the predicted"
-    )
-    command.add_argument(
-        "--time-limit", type=_positive, metavar="S", help="for each case; default: ten times the predicted"
-    )
+    what = "for each row; default: its worker's share of the memory"
+    command.add_argument("--memory-limit", type=_positive, metavar="GB", help=what)
+    what = "for each row, seconds; default: a day"
+    command.add_argument("--time-limit", type=_positive, default=86400.0, metavar="S", help=what)
     command.add_argument(
         "--reference", metavar="SESSION", help="reference state in BIDS derivatives; default: each patient's first"
     )
-    command.add_argument("--task", type=int, metavar="N", help="what --engine slurm starts: part N of its job array")
     command.set_defaults(targets=cohorts.TARGETS, patience_s=300.0)
     _add_set(command)
     what = "count the rows of a cohort that are done, failed and waiting"
@@ -337,6 +336,13 @@ def _count(text: str) -> int:
     if not re.fullmatch(r"[0-9]{1,4}", text) or not 1 <= int(text) <= 1000:
         raise argparse.ArgumentTypeError(f"{text[:20]!r} is no whole number from 1 to 1000")
     return int(text)
+
+
+def _shard(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no shard: write K/N, such as 1/4 to 4/4")
+    return int(match[1]), int(match[2])
 
 
 def _dots(text: str) -> int:

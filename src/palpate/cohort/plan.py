@@ -3,37 +3,52 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from uuid import uuid4
 
 from palpate.cohort.resolve import row_key
 from palpate.cohort.task import FAILURE_CLASSES, Limits, Outcome, Row, Task
-from palpate.errors import FolderInUse, InputDataError, ResourceError
+from palpate.errors import InputDataError, ResourceError
 from palpate.images.input_file import like
 from palpate.parallel import mapped
-from palpate.study.outputs import RESULT, OutputFolder, read_json, sha256_of, write_json
+from palpate.study.outputs import RESULT, read_json, sha256_of, write_json
 
 MARK = "done.json"
 DONE_SCHEMA = "palpate.done/1"
-RETRY_S = 0.1
+WITH_RESULT = ("", "solver")  # failure classes of rows whose estimate has written its result.json
 PLAN, CASES = "plan.json", "cases"
 SCHEMA = "palpate.plan/1"
 KEY = re.compile("[0-9a-f]{64}")
 
 
-def write_mark(folder: Path, outcome: Outcome) -> Outcome:
-    """Write the mark of a folder that this process holds, beside the result.json that it vouches for.
+@contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """Where the file at `path` is written anew, which it replaces when the block has ended well.
 
-    Raises `ResourceError` when the disk refuses.
+    Another run may do the same at the same time. Raises `ResourceError` when the disk refuses.
     """
+    place = path.with_name(f".{path.name}.{uuid4().hex}")
+    try:
+        yield place
+        place.replace(path)
+    except OSError as error:
+        raise ResourceError(f"cannot write {path}: {error.strerror or error}; free some space") from error
+    finally:
+        with suppress(OSError):
+            place.unlink(missing_ok=True)
+
+
+def write_mark(folder: Path, outcome: Outcome) -> Outcome:
+    """Write the mark of a row's folder, beside the result.json that it vouches for; `ResourceError`."""
     result = folder / RESULT
-    outcome = replace(outcome, result=sha256_of(result) if result.is_file() else "", cause="")
-    with OutputFolder(folder).new_files() as area:
-        write_json(area / MARK, {"schema": DONE_SCHEMA} | outcome.to_dict())
+    written = outcome.failure_class in WITH_RESULT and result.is_file()
+    outcome = replace(outcome, result=sha256_of(result) if written else "")
+    with replaced(folder / MARK) as place:
+        write_json(place, {"schema": DONE_SCHEMA} | outcome.to_dict())
     return outcome
 
 
@@ -53,33 +68,13 @@ def read_mark(folder: Path, *, checked: bool = True) -> Outcome | None:
     return found
 
 
-@contextmanager
-def held_soon(folder: Path, seconds: float = float("inf")) -> Iterator[None]:
-    """Hold a row's folder; while another process does, which may be about to end, wait so long.
-
-    Raises `FolderInUse` when that was not long enough, else as `OutputFolder.held` does.
-    """
-    end = time.monotonic() + seconds
-    with ExitStack() as stack:
-        while True:
-            try:
-                stack.enter_context(OutputFolder(folder).held())
-                break
-            except FolderInUse:
-                if time.monotonic() > end:
-                    raise
-            time.sleep(RETRY_S)
-        yield
-
-
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What a cohort computes: rows, the digest of each, --set of all, who computes, when it began (ISO 8601)."""
+    """What a cohort computes: rows, the digest of each, --set of all, rows at a time, when it began (ISO 8601)."""
 
     rows: tuple[Row, ...]
     keys: tuple[str, ...]
     overrides: tuple[str, ...] = ()
-    engine: str = "local"
     workers: int | None = None
     began: str = ""
 
@@ -98,16 +93,16 @@ class Plan:
         return Task(row, str((folder / CASES / row.id).absolute()), self.keys[number], self.overrides, limits)
 
 
-def make_plan(rows: Sequence[Row], overrides: Sequence[str], *, engine: str, workers: int | None, began: str) -> Plan:
+def make_plan(rows: Sequence[Row], overrides: Sequence[str], *, workers: int | None, began: str) -> Plan:
     """The plan of the rows, all their inputs digested as they are at the moment."""
     keys = mapped(partial(row_key, overrides=overrides), rows)
-    return Plan(tuple(rows), tuple(keys), tuple(overrides), engine, workers, began)
+    return Plan(tuple(rows), tuple(keys), tuple(overrides), workers, began)
 
 
 def write_plan(plan: Plan, folder: Path) -> None:
     """Put plan.json in place; raises `ResourceError` when the disk refuses."""
-    with OutputFolder(folder).new_files() as area:
-        write_json(area / PLAN, {"schema": SCHEMA} | asdict(plan))
+    with replaced(folder / PLAN) as place:
+        write_json(place, {"schema": SCHEMA} | asdict(plan))
 
 
 def read_plan(folder: Path) -> Plan:

@@ -22,7 +22,8 @@ from palpate.study.outputs import write_text
 CSV, PARQUET = "cohort.csv", "cohort.parquet"
 COLUMNS = ("id", "patient", "session", "stage", "state", "failure_class", "message", "warnings")
 UNITS = {"kPa": "kpa", "ratio": "ratio"}
-ADVICE = "the tables and statistics of a cohort need {}, which is not installed: pip install 'palpate[cohort]'"
+ADVICE = "a cohort needs {}, which is not installed: pip install 'palpate[cohort]'"
+LIBRARIES = ("pyarrow", "pandas", "statsmodels")
 
 
 def columns_of(records: Sequence[Record]) -> dict[str, list[Any]]:
@@ -56,9 +57,9 @@ def columns_of(records: Sequence[Record]) -> dict[str, list[Any]]:
     return columns
 
 
-def require_tables() -> None:
-    """Raise `ResourceError` where a library of the extra `cohort` is missing: before anything is computed."""
-    for library in ("pyarrow", "pandas", "statsmodels"):
+def require_libraries(*more: str) -> None:
+    """Raise `ResourceError` where a library of tables and statistics, or one `more`, is missing."""
+    for library in (*LIBRARIES, *more):
         try:
             import_module(library)
         except ImportError as error:
@@ -77,7 +78,7 @@ def write_csv(records: Sequence[Record], path: Path) -> None:
 
 def write_parquet(records: Sequence[Record], path: Path) -> None:
     """The same with types, texts as they are; raises `ResourceError` when the disk refuses or pyarrow is missing."""
-    require_tables()
+    require_libraries()
     pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
     numbers = ("_kpa", "_ratio", "_low95", "_high95")
     columns = columns_of(records)

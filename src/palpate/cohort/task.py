@@ -1,10 +1,9 @@
-"""What travels between a cohort, its engines and the processes that compute: plain values that are JSON."""
+"""What travels between a cohort and the workers that compute its rows: plain values."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from palpate.errors import (
@@ -12,7 +11,6 @@ from palpate.errors import (
     EstimationError,
     GeometryError,
     InputDataError,
-    PalpateError,
     ResourceError,
 )
 
@@ -24,17 +22,8 @@ CLASS_OF_EXIT_CODE = {
     ResourceError.exit_code: "resources",
 }
 FAILURE_CLASSES = (*CLASS_OF_EXIT_CODE.values(), "crash", "timeout", "lost")
-MEMORY_FACTOR = 2.0  # how far the prediction of `check` may be off
-LEAST_MEMORY_GB = 2.0  # small predictions are off by more: libraries alone take half of one
-TIME_FACTOR = 10.0  # a busy machine, and a start that takes long
-LEAST_SECONDS = 900.0
-
-
-def failure_class_of(error: BaseException) -> str:
-    """The failure class of an error, by the exit code that `estimate` would end with."""
-    if isinstance(error, MemoryError):
-        return "resources"
-    return CLASS_OF_EXIT_CODE.get(error.exit_code, "crash") if isinstance(error, PalpateError) else "crash"
+PROGRAM = ("-P", "-W", "ignore", "-m", "palpate.cohort.child")
+A_DAY = 86400.0  # seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,28 +49,18 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What one case may take: memory (GB) and time (s), None: a multiple of what is predicted for it."""
+    """What one row may take: memory (GB), None: its worker's share; time (s)."""
 
     memory_gb: float | None = None
-    seconds: float | None = None
-
-    def memory_for(self, expected_gb: float) -> float:
-        """Memory (GB) of a case whose estimate is predicted to take that much."""
-        return self.memory_gb or max(MEMORY_FACTOR * expected_gb, LEAST_MEMORY_GB)
-
-    def seconds_for(self, expected_seconds: float) -> float:
-        """Seconds by the clock of a case whose estimate is predicted to take that long."""
-        return self.seconds or max(TIME_FACTOR * expected_seconds, LEAST_SECONDS)
+    seconds: float = A_DAY
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
     """A row to be computed into its folder.
 
-    key: digest of what the row depends on, when the task was made; overrides: --set of the whole cohort; coarser: by
-    which factor the mesh is coarser than asked for; expected_gb: predicted memory (GB), None until an attempt has told;
-    room_gb: memory (GB) that it may count on where it runs, None: whatever there is; remarks: what earlier attempts
-    came to; attempt: number of this one, from 1.
+    key: digest of what the row depends on, when the task was made; overrides: --set of the whole cohort; program:
+    arguments of Python that run `palpate`.
     """
 
     row: Row
@@ -89,32 +68,14 @@ class Task:
     key: str = ""
     overrides: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
-    coarser: float = 1.0
-    expected_gb: float | None = None
-    room_gb: float | None = None
-    remarks: tuple[str, ...] = ()
-    attempt: int = 1
-
-    def to_json(self) -> str:
-        """One line of JSON."""
-        return json.dumps(asdict(self), allow_nan=False)
-
-    @classmethod
-    def from_json(cls, text: str | bytes) -> Task:
-        """The task that `to_json` wrote."""
-        content = json.loads(text)
-        row = content["row"] | {"after": tuple(content["row"]["after"])}
-        plain = {key: tuple(content[key]) for key in ("overrides", "remarks")}
-        return cls(**(content | plain | {"row": Row(**row), "limits": Limits(**content["limits"])}))
+    program: tuple[str, ...] = PROGRAM
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """What a row came to: `state` "done" or "failed" with a class and a sentence.
 
-    message of a row that is done: what to know of it, such as a coarser mesh; cause: why an attempt failed where the
-    class alone does not say whether another may succeed: "memory", "lost", or "room" for one that needs more room than
-    it had (expected_gb); result: SHA-256 of the result.json that it speaks of; seconds and peak_gb: what it took.
+    result: SHA-256 of the result.json that it speaks of; seconds and peak_gb: what it took.
     """
 
     id: str
@@ -122,11 +83,8 @@ class Outcome:
     key: str = ""
     failure_class: str = ""
     message: str = ""
-    cause: str = ""
     result: str = ""
-    attempts: int = 1
     seconds: float = 0.0
-    expected_gb: float | None = None
     peak_gb: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
@@ -134,11 +92,6 @@ class Outcome:
         return asdict(self)
 
     @classmethod
-    def failed(cls, task: Task, failure_class: str, message: str, *, cause: str = "") -> Outcome:
-        """A failure of a task's attempt."""
-        sentence = "; ".join((*task.remarks, message))
-        return cls(task.row.id, "failed", task.key, failure_class, sentence, cause, attempts=task.attempt)
-
-    def took(self, seconds: float, *, expected_gb: float | None, peak_gb: float | None) -> Outcome:
-        """The same with what it took."""
-        return replace(self, seconds=round(seconds, 3), expected_gb=expected_gb, peak_gb=peak_gb)
+    def failed(cls, task: Task, failure_class: str, message: str) -> Outcome:
+        """A failure of a task."""
+        return cls(task.row.id, "failed", task.key, failure_class, message)

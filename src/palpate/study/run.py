@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 
@@ -46,14 +46,12 @@ def estimate(
     *,
     progress: Progress = silent,
     truth: Mapping[str, float] | None = None,
-    condition: Callable[[ExpectedCost], None] | None = None,
     added: Added | None = None,
 ) -> CaseResult:
     """Estimate the Young's modulus of every `estimate` tissue of a case, from its images or its phantom.
 
     `truth`: true moduli (kPa) by tissue, to stand beside the estimates of a simulation; a phantom brings its own;
-    `condition`: is asked with what is expected to be taken, once the images are read, and may raise; `added`: to which
-    earlier estimate the case's later images are added.
+    `added`: to which earlier estimate the case's later images are added.
     Raises `ResourceError` where this machine has not the memory, `PalpateError`s of reading, meshing and solving; an
     iteration that did not converge is no error but a result whose status says so, with no values.
     """
@@ -67,8 +65,6 @@ def estimate(
     first = images.pairs[0]
     cost = expected_cost(case, first.before, first.after, n_pairs=len(images.pairs), mesh=first.mesh)
     refuse_lack(cost)
-    if condition is not None:
-        condition(cost)
     progress(_forecast(cost))
     if case.phantom:
         stated = [(t.name, t.youngs_modulus_kpa) for t in first.before.tissues if t.role is Role.ESTIMATE]

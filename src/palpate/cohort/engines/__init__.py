@@ -1,1 +1,0 @@
-"""Who computes the rows of a cohort: this machine, a Dask cluster, SLURM."""
