@@ -83,7 +83,7 @@ figures: install
 
 # case.schema.json, which the package ships, from the dataclasses that read a case.
 schemas: install
-	$(BIN)/python -c "import json; from palpate.study.json_schema import SCHEMAS, case_schema; \
+	$(BIN)/python -c "import json; from palpate.case.json_schema import SCHEMAS, case_schema; \
 	  (SCHEMAS / 'case.schema.json').write_text(json.dumps(case_schema(), indent=1) + '\n')"
 
 # The site in build/site; a link that leads nowhere ends it.

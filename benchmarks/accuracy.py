@@ -24,6 +24,7 @@ from cramer_rao import cramer_rao, model_to_image
 from numpy.typing import NDArray
 
 from palpate.approximation import LinearisationPoint, exact_approximation
+from palpate.body import Body
 from palpate.images import Role
 from palpate.inversion import (
     REPORTED,
@@ -39,7 +40,8 @@ from palpate.inversion import (
 from palpate.mesh import LagrangeSpace, triangle_normals
 from palpate.observation import NoiseModel, fit_noise_model, observed_surface
 from palpate.phantoms import Noise, Scene
-from palpate.study import Body, Observed, conclude, fitted_states
+from palpate.statement import Observed, conclude
+from palpate.study import fitted_states
 from palpate.uncertainty import FittedState, grid_position_shifts, imaging_errors
 
 Array = NDArray[np.float64]

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from palpate.body import Body, aligned, edge_length_of, inverse_problem, make_body
+from palpate.case import Case, Discrepancy, Domain, Mechanics, MeshSettings, Phantom
 from palpate.images import Role, segment
 from palpate.inversion import InverseProblem, InversionSettings, LaterState
 from palpate.mechanics import ACCURACY, NewtonSettings, finite_strain_model, linear_model, outer_constraint
@@ -20,20 +22,7 @@ from palpate.phantoms import (
     pelvis_grid,
     reimaged,
 )
-from palpate.study import (
-    Body,
-    Case,
-    Discrepancy,
-    Domain,
-    Mechanics,
-    MeshSettings,
-    Phantom,
-    aligned,
-    edge_length_of,
-    inverse_problem,
-    inversion_settings,
-    make_body,
-)
+from palpate.study import inversion_settings
 from palpate.unknowns import parameter_map, wall_blocks
 from palpate_validation.truth import exact_target, rescaled
 

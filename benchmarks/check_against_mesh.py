@@ -19,8 +19,8 @@ from typing import Any
 from random_pelves import random_pelvis, write_images
 
 import palpate
+from palpate.case import read_case
 from palpate.errors import PalpateError
-from palpate.study import read_case
 
 COLUMNS = ("seed", "body", "edge, mm", "`check`", "unknowns: predicted", "found", "`mesh`", "seconds: check", "mesh")
 

@@ -4,7 +4,7 @@
 
 Each case runs in its own process, from label images on disk, so that its peak memory is measured alone. `check` meshes,
 so its unknowns are those of the run. The guess before the mesh, by which `init` chooses an edge length, is printed,
-too. The constants of `palpate.study.cost` are fitted to the demo; the other runs show how far they hold. The machine
+too. The constants of `palpate.body.cost` are fitted to the demo; the other runs show how far they hold. The machine
 must be otherwise idle.
 `--mesh-only` only meshes, on any machine. The random pelves are always only meshed, because no mechanics moves them.
 Simulated data.
@@ -27,10 +27,12 @@ from memory import peak_mb
 from random_pelves import random_pelvis, write_images
 
 from palpate import check, init, make_mesh
+from palpate.body import ExpectedCost, expected_cost, read_states
+from palpate.case import Case, read_case
 from palpate.demo import DATA
 from palpate.images import Role, write_label_image
 from palpate.phantoms import PelvisOptions, Scene, SpheresOptions, pelvis, spheres
-from palpate.study import Case, ExpectedCost, estimate, expected_cost, read_case, read_states
+from palpate.study import estimate
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Run:
     fitted: bool = False
 
 
-GB_A_MEBIBYTE = 1024**2 / 1e9  # the unit of `palpate.study.cost`
+GB_A_MEBIBYTE = 1024**2 / 1e9  # the unit of `palpate.body.cost`
 RUNS = (
     Run("spheres", 8.0, modes=30),
     Run("spheres", 6.0),

@@ -31,25 +31,16 @@ from cramer_rao import fisher_information
 from numpy.typing import NDArray
 from scipy import stats
 
+from palpate.body import aligned, inverse_problem, make_body
+from palpate.case import Case, Mechanics, MeshSettings, Phantom
 from palpate.errors import EstimationError, PalpateError
 from palpate.images import segment
 from palpate.inversion import InverseProblem, Inversion, InversionSettings, StopRule, invert
 from palpate.mesh import LagrangeSpace
 from palpate.observation import NoiseModel, Observation, ObservedSurface, SurfaceDistance, surface_distance
 from palpate.phantoms import Scene
-from palpate.study import (
-    Case,
-    Mechanics,
-    MeshSettings,
-    Phantom,
-    aligned,
-    as_stated,
-    estimates_of,
-    intervals_of,
-    inverse_problem,
-    inversion_settings,
-    make_body,
-)
+from palpate.statement import as_stated, estimates_of, intervals_of
+from palpate.study import inversion_settings
 from palpate.uncertainty import covariance_of, gain, noise_covariance
 from palpate.unknowns import Choice
 from palpate_validation.truth import target_of_truth

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 import palpate
+from palpate.body import loads_on
 from palpate.export import fitted_bodies, material_parts, prescribed
 from palpate.mechanics import Dilatation, equilibrium
 from palpate.mesh import OUTER, Constraint
-from palpate.study import loads_on
 
 Array = NDArray[np.float64]
 

@@ -33,10 +33,10 @@ import nibabel
 import numpy as np
 from spoilt_cases import CASES, NAMES, override, spoilt_case, spoilt_table, toml_of
 
+from palpate.case import read_case
 from palpate.cli import main as palpate_command
 from palpate.errors import PalpateError
 from palpate.images import read_label_table
-from palpate.study import read_case
 
 importlib.import_module("palpate.study.check")  # before processes are forked that would import it each
 ESTIMATE = importlib.import_module("palpate.study.run")

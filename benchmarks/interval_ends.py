@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from palpate.approximation import ReducedBasis
 from palpate.inversion import Bounds, Objective, frozen_posterior, invert
-from palpate.study import StatedPosterior, as_stated
+from palpate.statement import StatedPosterior, as_stated
 from palpate.uncertainty import Profile, covariance_of, modulus_interval
 
 NO_GRID = 3  # draws of a voxel grid, in which nothing is off

@@ -37,8 +37,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from palpate.body import inverse_problem, make_body, read_states
+from palpate.case import Case, read_case
 from palpate.inversion import Inversion, invert
-from palpate.study import Case, estimate, inverse_problem, inversion_settings, make_body, read_case, read_states
+from palpate.study import estimate, inversion_settings
 from palpate.uncertainty import StiffnessMap
 
 Array = NDArray[np.float64]

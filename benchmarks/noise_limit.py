@@ -20,19 +20,13 @@ from accuracy_rows import NOISE, ROWS, from_voxels, truth_of
 from cramer_rao import cramer_rao, efficient_gain, model_to_image, target_of
 from numpy.typing import NDArray
 
+from palpate.body import aligned
+from palpate.case import Case, Mechanics, MeshSettings, Phantom
 from palpate.images import segment
 from palpate.inversion import Evaluation, invert
 from palpate.observation import NoiseModel, surface_distances
 from palpate.phantoms import pelvis_grid, reimaged
-from palpate.study import (
-    Case,
-    Mechanics,
-    MeshSettings,
-    Phantom,
-    aligned,
-    fitted_states,
-    inversion_settings,
-)
+from palpate.study import fitted_states, inversion_settings
 from palpate.uncertainty import gain
 
 ROW = ROWS["finite-noise"]

@@ -37,9 +37,9 @@ from typing import Any
 import nibabel
 import numpy as np
 
+from palpate.case import read_case
 from palpate.cli import main as palpate
-from palpate.study import read_case, read_json
-from palpate.study.run import estimate, make_mesh
+from palpate.study import estimate, make_mesh, read_json
 
 DOCUMENTS = {"estimate": "result.json", "mesh": "mesh.json"}
 HIDDEN = (".palpate.lock", ".writing-outputs", "log.txt")

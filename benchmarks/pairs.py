@@ -22,9 +22,11 @@ from typing import Any
 
 import numpy as np
 
+from palpate.body import ImagedStates, aligned
+from palpate.case import Case, Mechanics, Phantom
 from palpate.images import LabelImage, segment
 from palpate.phantoms import Noise, PelvisOptions, Scene, pelvis, pelvis_grid, reimaged
-from palpate.study import Case, ImagedStates, Mechanics, Phantom, aligned, estimate_states
+from palpate.study import estimate_states
 
 PAIRS = 4
 NOISE = Noise(surface_sd_mm=0.3, correlation_length_mm=6.0)

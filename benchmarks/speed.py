@@ -33,6 +33,8 @@ from speed_stages import shares_of_stages
 
 from multifrontal import analyse
 from palpate.approximation import ReducedBasis, reduced_basis
+from palpate.body import aligned, inverse_problem, make_body
+from palpate.case import Case, Discrepancy, Domain, Mechanics, MeshSettings, Phantom
 from palpate.images import segment
 from palpate.inversion import (
     InverseProblem,
@@ -46,18 +48,7 @@ from palpate.mesh import lagrange_space, tetrahedralise
 from palpate.observation import SEGMENTATION_NOISE, prescribed_motion
 from palpate.parallel import blas_on_one_thread
 from palpate.phantoms import PelvisOptions, Scene, pelvis, pelvis_anatomy
-from palpate.study import (
-    Case,
-    Discrepancy,
-    Domain,
-    Mechanics,
-    MeshSettings,
-    Phantom,
-    aligned,
-    inverse_problem,
-    inversion_settings,
-    make_body,
-)
+from palpate.study import inversion_settings
 from palpate.uncertainty import sandwich_covariance
 
 PARTS = "solver,linear,nonlinear,gradient,scaling,front_end,default,signals,field,map"

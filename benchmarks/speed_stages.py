@@ -7,9 +7,11 @@ import pstats
 from pathlib import Path
 from typing import Any
 
+from palpate.body import aligned
+from palpate.case import Case
 from palpate.images import segment
 from palpate.phantoms import Scene
-from palpate.study import Case, aligned, estimate_states
+from palpate.study import estimate_states
 
 __all__ = ["shares_of_stages"]
 

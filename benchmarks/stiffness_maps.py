@@ -31,6 +31,8 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.spatial.distance import cdist
 
+from palpate.body import aligned, inverse_problem, make_body
+from palpate.case import Case, Mechanics, MeshSettings, Phantom
 from palpate.images import FieldPrior, segment
 from palpate.inversion import InverseProblem, invert
 from palpate.mechanics import law_named
@@ -48,16 +50,7 @@ from palpate.phantoms import (
     pelvis_motions,
     reimaged,
 )
-from palpate.study import (
-    Case,
-    Mechanics,
-    MeshSettings,
-    Phantom,
-    aligned,
-    inverse_problem,
-    inversion_settings,
-    make_body,
-)
+from palpate.study import inversion_settings
 from palpate.uncertainty import NORMAL_95, Interval, sandwich_covariance, stiffness_maps
 from palpate_validation.mismatch import patched
 

@@ -14,7 +14,7 @@ from palpate.images.alignment import RigidMotion
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.study.result import CaseResult
+from palpate.statement.result import CaseResult
 
 TISSUES = (
     Tissue("prostate", Role.ESTIMATE, (1,)),

@@ -15,6 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.body.imaged import LaterImage
+from palpate.case.case import Case, CaseTissue, Estimate, Images
+from palpate.case.case_file import read_case
 from palpate.errors import PalpateError
 from palpate.findings import MOST_WORDS, SENTENCE_END, Finding, words_in
 from palpate.images.label_image import LabelImage, VoxelGrid
@@ -27,14 +30,11 @@ from palpate.mesh.tetrahedralise import boundary_of
 from palpate.observation.contract import Fit
 from palpate.progress import silent
 from palpate.report import render
+from palpate.statement.estimated import Estimation, Iteration, ModulusEstimate, Start, StatedExplanation, TissueFit
+from palpate.statement.result import CaseResult, MeshSummary, PairResult, Provenance
+from palpate.statement.samples import ModulusSamples
 from palpate.study import run
-from palpate.study.case import Case, CaseTissue, Estimate, Images
-from palpate.study.case_file import read_case
 from palpate.study.check import check_case
-from palpate.study.estimated import Estimation, Iteration, ModulusEstimate, Start, StatedExplanation, TissueFit
-from palpate.study.imaged import LaterImage
-from palpate.study.result import CaseResult, MeshSummary, PairResult, Provenance
-from palpate.study.samples import ModulusSamples
 from palpate.uncertainty import Covariance
 
 sys.path.insert(0, str(Path(__file__).parent))  # tests are no package; dicom_files.py lies here

@@ -15,17 +15,17 @@ import warnings
 import pytest
 
 from palpate import errors
+from palpate.case.case_file import read_case
 from palpate.cli import main
 from palpate.cli.parser import EXAMPLES, make_parser
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import ImageFormat
 from palpate.images.readers.registry import register
 from palpate.progress import Line
+from palpate.statement.result import MeshResult, Simulation
 from palpate.study import run
 from palpate.study import simulate as simulation
-from palpate.study.case_file import read_case
 from palpate.study.earlier import strange_files
-from palpate.study.result import MeshResult, Simulation
 
 FILES = {
     *(

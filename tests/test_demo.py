@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from palpate.case.case_file import read_case
 from palpate.cli import main
 from palpate.demo import DATA, run_demo
 from palpate.progress import STAGES, Forecast, Line, Told
-from palpate.study import read_case
 from palpate.study.outputs import RESULT, RESULT_FILES
 
 ROOT = Path(__file__).parents[1]

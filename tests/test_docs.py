@@ -14,10 +14,10 @@ import pytest
 from markdown_it import MarkdownIt
 
 import palpate
+from palpate.case.case import CaseSurface, Domain, DriverMotion, Estimate, Mechanics, MeshSettings
+from palpate.case.case_file import read_case
 from palpate.findings import CODES, HARMLESS, MISLEADING, WIDENING
 from palpate.mechanics.laws.registry import law_parameters
-from palpate.study.case import CaseSurface, Domain, DriverMotion, Estimate, Mechanics, MeshSettings
-from palpate.study.case_file import read_case
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])

@@ -11,6 +11,7 @@ from types import SimpleNamespace as Stand
 import numpy as np
 import pytest
 
+from palpate.body.imaged import alignment_findings
 from palpate.findings import (
     CODES,
     HARMLESS,
@@ -26,8 +27,7 @@ from palpate.findings import (
 )
 from palpate.images.alignment import Alignment, RigidFit, RigidMotion
 from palpate.images.checks import later_names
-from palpate.study.estimate_findings import inversion_findings
-from palpate.study.imaged import alignment_findings
+from palpate.statement.estimate_findings import inversion_findings
 
 SEEN = [Finding("thin", f"thin in {image}", "prostate", f"in {image}") for image in ("before", "after[1]", "after[2]")]
 

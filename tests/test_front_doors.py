@@ -10,6 +10,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LAYERS = (
+    "body",
+    "case",
     "export",
     "images",
     "inversion",
@@ -18,6 +20,7 @@ LAYERS = (
     "observation",
     "phantoms",
     "report",
+    "statement",
     "study",
     "uncertainty",
 )

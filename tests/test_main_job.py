@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 import referencing
 
+from palpate.case.case_file import read_case
+from palpate.case.json_schema import SCHEMAS
 from palpate.cli import main
 from palpate.export.model_file import read_model
 from palpate.images.readers import write_label_image
 from palpate.report.tornado import is_covered
-from palpate.study.case_file import read_case
-from palpate.study.json_schema import SCHEMAS
 from scenes import VOXEL_MM, balls
 
 TRUTH_KPA = {"core": 60.0, "shell": 30.0}

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from palpate import processes
+from palpate.body import refusals
 from palpate.errors import ResourceError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.study import refusals
 
 
 @pytest.fixture

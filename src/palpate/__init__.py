@@ -10,6 +10,8 @@ TYPE_CHECKING = False  # the module typing takes longer to import than all that 
 if TYPE_CHECKING:
     from typing import Any
 
+    from palpate.case.case import Case as Case
+    from palpate.case.case_file import read_case as read_case
     from palpate.export.folder import export as export
     from palpate.steps.commands import check as check
     from palpate.steps.commands import estimate as estimate
@@ -23,8 +25,6 @@ if TYPE_CHECKING:
     from palpate.steps.figures import figures as figures
     from palpate.steps.results import CaseResult as CaseResult
     from palpate.steps.results import SavedResult as SavedResult
-    from palpate.study.case import Case as Case
-    from palpate.study.case_file import read_case as read_case
 
 _named, _names = front_door(__name__)
 

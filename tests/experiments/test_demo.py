@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from palpate.case.case_file import read_case
 from palpate.demo import DATA, LAW
 from palpate.images.tissue import Role
-from palpate.study.case_file import read_case
 
 
 def test_the_demo_case_can_be_read_and_has_its_images():

@@ -15,7 +15,7 @@ from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.label_table import read_label_table
 from palpate.images.tissue import Role
 from palpate.mesh.locate import region_image
-from palpate.study.result import MeshResult, Simulation
+from palpate.statement.result import MeshResult, Simulation
 
 
 def test_a_voxel_has_the_region_of_its_tetrahedron(case_result):

@@ -14,13 +14,13 @@ import pytest
 
 import palpate
 from bodies import with_first_pair
+from palpate.case.case import Images
 from palpate.cli import main
 from palpate.errors import ConfigurationError, EstimationError, InputDataError
 from palpate.export.fitted_model import fitted_model
 from palpate.export.formats import FORMATS
 from palpate.export.model_file import read_model
 from palpate.report import case_report
-from palpate.study.case import Images
 from palpate.study.earlier import seal_of
 from palpate.study.outputs import sha256_of
 

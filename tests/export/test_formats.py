@@ -23,6 +23,8 @@ from scipy.spatial.transform import Rotation
 import palpate
 from bodies import with_first_pair
 from dicom_files import PLANTED, TILTED, ct_slices, save_series
+from palpate.body.case_loads import loads_on
+from palpate.case.case import CaseLoad
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.export import abaqus, febio
 from palpate.export.fitted_model import fitted_model
@@ -38,8 +40,6 @@ from palpate.mesh.surface import triangle_normals
 from palpate.mesh.tet_mesh import FACES
 from palpate.report.collect import collect
 from palpate.report.scales import modulus_scale, shown_moduli
-from palpate.study.case import CaseLoad
-from palpate.study.case_loads import loads_on
 
 VOLUME = 1e-4  # relative
 LPS = np.array([-1.0, -1.0, 1.0])

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.body.poisson_ratios import eta_of_ratio, eta_slope, sought_ratios, with_ratios
 from palpate.inversion import InverseProblem, LaterState, Objective, frozen_posterior, invert
 from palpate.inversion.starts import informed_start
 from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.material import material_modes
 from palpate.observation.noise_model import NoiseModel
-from palpate.study.poisson_ratios import eta_of_ratio, eta_slope, sought_ratios, with_ratios
 from palpate.uncertainty.covariance import covariance_among, covariance_of
 from palpate.unknowns import parameter_map, sought_ratio_blocks, unit_blocks
 

@@ -9,8 +9,8 @@ import tomllib
 
 import pytest
 
+from palpate.case.case_file import read_case
 from palpate.cli import main
-from palpate.study.case_file import read_case
 
 
 def document(out):

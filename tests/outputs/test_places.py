@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from children import in_a_child
+from palpate.case.case_file import read_case
 from palpate.cli import main
 from palpate.errors import ResourceError
 from palpate.export.case_files import file_name
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.steps.previewing import new_case_with_page
-from palpate.study.case_file import read_case
 from palpate.study.outputs import OutputFolder
 
 MINE = ("link", "dangling link", "hard link", "pipe", "folder")
@@ -142,7 +142,7 @@ def test_a_case_leads_to_its_images_from_wherever_it_lies(images, tmp_path):
 AS_NOBODY = """
 import os, sys
 from palpate.cli import main
-import palpate.cli.entry, palpate.steps.display, palpate.study.new_case, palpate.study.case_file, scipy.linalg
+import palpate.cli.entry, palpate.steps.display, palpate.study.new_case, palpate.case.case_file, scipy.linalg
 os.getuid() or os.setuid(65534)
 sys.exit(main(sys.argv[1:]))
 """

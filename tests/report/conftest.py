@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.body.imaged import LaterImage
+from palpate.case.case import Images, Pair
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.space import lagrange_space
 from palpate.report import pictures
-from palpate.study.case import Images, Pair
-from palpate.study.imaged import LaterImage
-from palpate.study.result import PairResult
+from palpate.statement.result import PairResult
 
 AWAY = np.array([0.0, 0.0, 50.0])
 

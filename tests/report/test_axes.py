@@ -16,8 +16,8 @@ from palpate.cohort import charts as cohort_charts
 from palpate.report import charts, tornado
 from palpate.report.collect import collect
 from palpate.report.svg import STYLE
-from palpate.study.together import ImagePairs, ModulusRegion, PairAlone
-from palpate.study.variations import Variation
+from palpate.statement.together import ImagePairs, ModulusRegion, PairAlone
+from palpate.statement.variations import Variation
 
 TURN = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
 EDGE = tuple((58.9 * math.exp(0.4 * math.cos(t)), 31.2 * math.exp(0.5 * math.sin(t))) for t in TURN.tolist())

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 
 from bodies import ELSEWHERE, STILL, body
+from palpate.body.imaged import brought
+from palpate.case.case import Case, CaseTissue, Images
 from palpate.images.readers import write_scalar_image
 from palpate.observation.contract import PointMotions
 from palpate.report.case_report import write_case_report
 from palpate.report.collect import collect
 from palpate.report.preview import preview_page
 from palpate.report.scales import modulus_scale
-from palpate.study.case import Case, CaseTissue, Images
+from palpate.statement.estimated import PointFit
 from palpate.study.check import Checked, CheckReport
-from palpate.study.estimated import PointFit
-from palpate.study.imaged import brought
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no playwright; pip install palpate[browser]")
 

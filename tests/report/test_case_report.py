@@ -19,6 +19,7 @@ import pytest
 from markupsafe import escape
 
 from bodies import with_first_pair
+from palpate.case.case import Mechanics
 from palpate.errors import InputDataError, NotConverged
 from palpate.findings import Finding
 from palpate.images.readers import write_scalar_image
@@ -28,9 +29,8 @@ from palpate.report.collect import MOST_LATER, collect
 from palpate.report.page import render
 from palpate.report.pairs import drawn_images
 from palpate.report.rows import explanation_rows, number
-from palpate.study.case import Mechanics
-from palpate.study.together import ImagePairs, ModulusRegion, PairAlone
-from palpate.study.variations import Variation
+from palpate.statement.together import ImagePairs, ModulusRegion, PairAlone
+from palpate.statement.variations import Variation
 
 EVIL = '</script><img src=x onerror=alert(1)>$\\frac{"&'
 

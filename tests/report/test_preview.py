@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from bodies import ELSEWHERE, STILL, body
+from palpate.body.imaged import brought
+from palpate.case.case import Case, CaseTissue, Images
 from palpate.findings import HELP
 from palpate.report.preview import GENERATOR, preview_page
-from palpate.study.case import Case, CaseTissue, Images
 from palpate.study.check import Checked, CheckReport, Problem
-from palpate.study.imaged import brought
 from palpate.study.prediction import PredictedModulus, Prediction
 
 NASTY = "<img src=x onerror=alert(1)>"

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from bodies import with_first_pair
+from palpate.body.imaged import LaterImage
 from palpate.images.distance import observation_width, tissue_distance_map
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.report.pairs import bone_distances
 from palpate.report.surfaces import carried_outline, image_surface, model_surface, outer_first
-from palpate.study.imaged import LaterImage
 
 TURNED = np.array([[0, 1.5, 0, -5.0], [1.0, 0, 0, -5.0], [0, 0, -2.0, 50.0], [0, 0, 0, 1]])
 

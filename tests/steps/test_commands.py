@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 import palpate
+from palpate.case.case import Estimate
 from palpate.cli import main
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.study import run
-from palpate.study.case import Estimate
 from palpate.study.lock import folder_lock
 
 CASE = """

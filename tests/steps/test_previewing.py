@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 import palpate
+from palpate.body.cost import expected_cost
+from palpate.body.read import read_states
 from palpate.cli import main
 from palpate.errors import ConfigurationError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.progress import Forecast
 from palpate.report.preview import GENERATOR
-from palpate.study import expected_cost, read_states
 
 NAMES = {"1": "prostate", "2": "rectum", "3": "body"}
 

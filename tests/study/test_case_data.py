@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.case.case import DriverMotion, MeshSettings
+from palpate.case.case_data import CaseData
+from palpate.case.case_file import read_case
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
@@ -20,9 +23,6 @@ from palpate.observation.contract import DataFile
 from palpate.observation.registry import SOURCES, SourceKind
 from palpate.report.collect import collect
 from palpate.report.methods import methods_text
-from palpate.study.case import DriverMotion, MeshSettings
-from palpate.study.case_data import CaseData
-from palpate.study.case_file import read_case
 from palpate.study.check import check_case
 from palpate.study.run import estimate
 from palpate.study.simulate import simulate

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from palpate.case.case import SOLVER_NAMES
+from palpate.case.case_file import read_case
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
 from palpate.mechanics.solvers.registry import SOLVERS
-from palpate.study.case import SOLVER_NAMES
-from palpate.study.case_file import read_case
 
 SMALL = """
 [images]

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.case.case import CaseLoad
+from palpate.case.case_file import read_case
 from palpate.errors import ConfigurationError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.images.segmentation import first_labels
 from palpate.mechanics.element import largest_strains
-from palpate.study.case import CaseLoad
-from palpate.study.case_file import read_case
 from palpate.study.run import estimate
 from palpate.study.simulate import simulate
 

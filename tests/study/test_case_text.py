@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from palpate.case.case_file import case_tables, case_text, read_case
 from palpate.errors import ConfigurationError
-from palpate.study.case_file import case_tables, case_text, read_case
 
 TISSUES = """
 [tissues."left hip"]

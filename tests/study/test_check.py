@@ -7,14 +7,15 @@ import json
 
 import pytest
 
+from palpate.body import cost
+from palpate.body.cost import expected_cost, expected_tets
+from palpate.case.case_file import read_case
 from palpate.cli import main
 from palpate.errors import ResourceError
 from palpate.images.readers import write_label_image
 from palpate.mechanics.solvers import registry
-from palpate.study import check, cost
-from palpate.study.case_file import read_case
+from palpate.study import check
 from palpate.study.check import check_case
-from palpate.study.cost import expected_cost, expected_tets
 from palpate.study.run import estimate
 from scenes import coarse_balls
 

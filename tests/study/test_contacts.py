@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.body.contacts import contact_findings, front_findings, motion_findings, sides_findings
+from palpate.body.refusals import refuse_lost, refuse_unmeshable
 from palpate.errors import GeometryError, InputDataError
 from palpate.images.checks import wall_motion
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.segmentation import Segmentation, segment
 from palpate.images.tissue import Role, Tissue
-from palpate.study.contacts import contact_findings, front_findings, motion_findings, sides_findings
-from palpate.study.refusals import refuse_lost, refuse_unmeshable
 
 TISSUES = (
     Tissue("organ", Role.ESTIMATE, (1,)),

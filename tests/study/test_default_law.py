@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from palpate.case.case_file import read_case
 from palpate.images.readers import write_label_image
 from palpate.phantoms.spheres import SpheresOptions, spheres
-from palpate.study.case_file import read_case
 from palpate.study.run import estimate
 
 TRUTH_KPA = {"core": 60.0, "shell": 30.0}

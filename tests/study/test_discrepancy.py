@@ -10,7 +10,7 @@ import pytest
 from palpate.inversion import InverseProblem, LaterState, invert
 from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
-from palpate.study.discrepancy import FoundDiscrepancy, OffsetFound, discrepancy_findings, discrepancy_of
+from palpate.statement.discrepancy import FoundDiscrepancy, OffsetFound, discrepancy_findings, discrepancy_of
 from palpate.uncertainty import FittedState
 from palpate.unknowns import offset_block, parameter_map, unit_blocks
 

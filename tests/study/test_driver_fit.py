@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.study.driver_fit import fit_driver
+from palpate.body.driver_fit import fit_driver
 
 
 def test_the_driver_alone_is_fitted_at_given_moduli(twin, exact):

@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from palpate.body.edge_length import EdgeLength, edge_length_of
+from palpate.case.case import Case, Mechanics, MeshSettings, Noise, Phantom
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
-from palpate.study.case import Case, Mechanics, MeshSettings, Noise, Phantom
-from palpate.study.edge_length import EdgeLength, edge_length_of
 
 TISSUES = (
     Tissue("gland", Role.ESTIMATE, (1,)),

@@ -13,10 +13,10 @@ from palpate.images.tissue import Role
 from palpate.inversion import REPORTED, Explanation, Inversion, Mixture, Outcome, frozen_posterior, gauss_newton, invert
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
-from palpate.study.estimation import Observed, conclude
-from palpate.study.samples import draw_moduli
-from palpate.study.stated_posterior import as_stated, profiled
-from palpate.study.verdicts import estimates_of, intervals_of, or_as_ratio, verdict
+from palpate.statement.estimation import Observed, conclude
+from palpate.statement.samples import draw_moduli
+from palpate.statement.stated_posterior import as_stated, profiled
+from palpate.statement.verdicts import estimates_of, intervals_of, or_as_ratio, verdict
 from palpate.uncertainty import (
     FittedState,
     grid_position_shifts,

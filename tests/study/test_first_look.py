@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.case.case import Case, CaseTissue, Domain, Images
 from palpate.images.label_image import VoxelGrid
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role, Tissue
 from palpate.mesh.anatomy import domain_box
-from palpate.study.case import Case, CaseTissue, Domain, Images
 from palpate.study.first_look import frame_look, tissue_looks
 
 IMAGES = Images(Path("before.nii.gz"), (Path("after.nii.gz"),))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bodies import ELSEWHERE, STILL, body
+from palpate.body.imaged import brought
 from palpate.images.alignment import RigidMotion
-from palpate.study.imaged import brought
 
 
 def codes(after, method: str) -> list[str]:

@@ -11,10 +11,10 @@ import jsonschema
 import pytest
 import referencing
 
+from palpate.case.json_schema import SCHEMAS, case_schema
 from palpate.demo import DATA
 from palpate.errors import NotConverged
-from palpate.study.json_schema import SCHEMAS, case_schema
-from palpate.study.result import failure_document
+from palpate.statement.result import failure_document
 
 DOCS = Path(__file__).parents[2] / "docs"
 CASE = json.loads((SCHEMAS / "case.schema.json").read_text(encoding="utf-8"))

@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 import palpate
+from palpate.body.body import joint_problem, make_body
+from palpate.body.read import read_states
 from palpate.cli import main
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.readers import write_label_image
 from palpate.phantoms.spheres import SpheresOptions, spheres
 from palpate.progress import silent
+from palpate.statement.known_images import FORMAT, KnownImages, added_name, digest_of, why_together
 from palpate.study.archive import read_archive, write_archive
-from palpate.study.body import joint_problem, make_body
-from palpate.study.known_images import FORMAT, KnownImages, added_name, digest_of, why_together
 from palpate.study.outputs import KNOWN_IMAGES
-from palpate.study.read import read_states
 
 CASE = """
 [images]

@@ -8,6 +8,7 @@ import pytest
 
 import palpate
 from bodies import box_cells
+from palpate.case.case_file import read_case
 from palpate.errors import ConfigurationError, NotConverged
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.boundary import outer_constraint
@@ -19,7 +20,6 @@ from palpate.mesh.space import lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.observation.prescribed_motion import prescribed_motion
-from palpate.study.case_file import read_case
 from palpate.study.run import estimate
 
 MODULUS, SIZE = 60.0, (60.0, 10.0, 10.0)

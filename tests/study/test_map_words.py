@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.study.map_words import map_findings, map_words
+from palpate.statement.map_words import map_findings, map_words
 from palpate.uncertainty import DifferentRegion, StiffnessMap
 
 

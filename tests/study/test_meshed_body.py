@@ -14,6 +14,11 @@ import pytest
 import palpate
 from bodies import box_cells
 from mesh_writers import abaqus, block, gmsh_2, gmsh_4, numbered
+from palpate.body.body import inverse_problem, make_body
+from palpate.body.case_loads import case_loads
+from palpate.body.cost import expected_cost
+from palpate.body.read import read_states
+from palpate.case.case_file import read_case
 from palpate.cli import main
 from palpate.errors import ConfigurationError, GeometryError, InputDataError
 from palpate.export.fitted_model import fitted_model
@@ -26,12 +31,7 @@ from palpate.mesh.surface import triangle_normals
 from palpate.mesh.tetrahedralise import boundary_of
 from palpate.phantoms.shapes import rotation_about
 from palpate.report.collect import collect
-from palpate.study.body import inverse_problem, make_body
-from palpate.study.case_file import read_case
-from palpate.study.case_loads import case_loads
 from palpate.study.check import check_case
-from palpate.study.cost import expected_cost
-from palpate.study.read import read_states
 from palpate.study.run import estimate
 
 SIZE, STRAIN, MODULUS, RATIO = (20.0, 20.0, 30.0), 0.04, 50.0, 0.3

@@ -6,17 +6,17 @@ import dataclasses
 
 import pytest
 
+from palpate.body import meshing
+from palpate.body.body import make_body
+from palpate.body.edge_length import EdgeLength
+from palpate.body.imaged import ImagedStates
+from palpate.body.meshing import mesh_reference
+from palpate.case.case_file import case_text
 from palpate.errors import GeometryError, MeshQualityError
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image
 from palpate.progress import silent
-from palpate.study import meshing
-from palpate.study.body import make_body
-from palpate.study.case_file import case_text
 from palpate.study.check import check_case
-from palpate.study.edge_length import EdgeLength
-from palpate.study.imaged import ImagedStates
-from palpate.study.meshing import mesh_reference
 
 
 @pytest.fixture

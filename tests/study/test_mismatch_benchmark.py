@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.case.case_file import read_case
 from palpate.images.readers import read_label_image
-from palpate.study.case_file import read_case
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 

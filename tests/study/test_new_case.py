@@ -9,6 +9,9 @@ import nibabel
 import numpy as np
 import pytest
 
+from palpate.body.cost import expected_cost
+from palpate.body.read import read_segmentation, read_states
+from palpate.case.case_file import read_case
 from palpate.cli import main
 from palpate.demo import DATA
 from palpate.errors import ConfigurationError, InputDataError
@@ -18,11 +21,8 @@ from palpate.images.readers import read_label_image, write_label_image
 from palpate.images.tissue import Role
 from palpate.progress import silent
 from palpate.study import check
-from palpate.study.case_file import read_case
-from palpate.study.cost import expected_cost
 from palpate.study.guess import class_names, guess_tissues
 from palpate.study.new_case import CaseImages, new_case
-from palpate.study.read import read_segmentation, read_states
 
 GRID = VoxelGrid((30, 30, 30), np.diag([2.0, 2.0, 2.0, 1.0]))
 NAMES = {1: "Prostate", 2: "urinary_bladder", 3: "rectum", 4: "femur_left", 5: "colon", 6: "prostateTumour", 9: "body"}

@@ -7,14 +7,14 @@ import json
 import numpy as np
 import pytest
 
+from palpate.case.case_file import read_case
+from palpate.case.tissue_names import found_word
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image
 from palpate.images.tissue import Role
-from palpate.study.case_file import read_case
 from palpate.study.guess import guess_tissues, volume_change
 from palpate.study.new_case import CaseImages, new_case
-from palpate.study.tissue_names import found_word
 
 BOXES = VoxelGrid((40, 20, 20), np.diag([2.0, 2.0, 2.0, 1.0]))
 GROWN = 6  # voxels along an edge of five: by a fifth

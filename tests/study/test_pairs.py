@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from palpate.body.read import read_pairs
+from palpate.case.case_file import read_case
 from palpate.cli import main
 from palpate.errors import ConfigurationError
 from palpate.images.readers import write_label_image
-from palpate.study.case_file import read_case
-from palpate.study.read import read_pairs
 from scenes import coarse_balls
 
 CASE = """

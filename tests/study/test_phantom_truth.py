@@ -7,11 +7,11 @@ import inspect
 
 import pytest
 
+from palpate.body import read
+from palpate.case.case_file import read_case
 from palpate.errors import ConfigurationError
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.phantoms.scene import make_scene
-from palpate.study import read
-from palpate.study.case_file import read_case
 
 CASE = """
 [phantom]

@@ -6,8 +6,14 @@ import dataclasses
 
 import pytest
 
-from palpate.study.case import Case
-from palpate.study.plausibility import PUBLISHED, estimate_warnings, plausibility_warnings, published_for, unit_warnings
+from palpate.case.case import Case
+from palpate.statement.plausibility import (
+    PUBLISHED,
+    estimate_warnings,
+    plausibility_warnings,
+    published_for,
+    unit_warnings,
+)
 
 
 def test_every_published_value_has_range_method_and_source():

@@ -13,16 +13,7 @@ import pytest
 import referencing
 
 from bodies import box_cells
-from palpate.cli import main
-from palpate.cli.outcome import estimates_table
-from palpate.errors import ConfigurationError, NotConverged
-from palpate.export.fitted_model import fitted_model
-from palpate.images.readers import write_label_image
-from palpate.report.case_report import write_case_report, write_failure_report
-from palpate.study.case import Estimate
-from palpate.study.case_file import read_case
-from palpate.study.json_schema import SCHEMAS
-from palpate.study.poisson_ratios import (
+from palpate.body.poisson_ratios import (
     PoissonRatioEstimate,
     eta_of_ratio,
     eta_slope,
@@ -31,7 +22,16 @@ from palpate.study.poisson_ratios import (
     sought_priors,
     with_ratios,
 )
-from palpate.study.result import failure_document
+from palpate.case.case import Estimate
+from palpate.case.case_file import read_case
+from palpate.case.json_schema import SCHEMAS
+from palpate.cli import main
+from palpate.cli.outcome import estimates_table
+from palpate.errors import ConfigurationError, NotConverged
+from palpate.export.fitted_model import fitted_model
+from palpate.images.readers import write_label_image
+from palpate.report.case_report import write_case_report, write_failure_report
+from palpate.statement.result import failure_document
 from palpate.study.run import estimate
 from palpate.study.sensitivity import sensitivity
 from palpate.uncertainty import Covariance

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.body.body import make_body
+from palpate.body.imaged import aligned
+from palpate.case.case import Case, CaseTissue, Discrepancy, DriverMotion, Images, Mechanics, MeshSettings, Noise
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
-from palpate.study.body import make_body
-from palpate.study.case import Case, CaseTissue, Discrepancy, DriverMotion, Images, Mechanics, MeshSettings, Noise
-from palpate.study.imaged import aligned
 from palpate.study.prediction import predicted_intervals
 from palpate.study.run import estimate_states
 from palpate.uncertainty import NORMAL_95

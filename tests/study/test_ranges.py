@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from palpate.case.case import Case, CaseTissue
+from palpate.case.case_file import read_case
+from palpate.case.schema import Rule, rule
 from palpate.errors import ConfigurationError
 from palpate.images.named_labels import MAX_LABEL
-from palpate.study.case import Case, CaseTissue
-from palpate.study.case_file import read_case
-from palpate.study.schema import Rule, rule
 
 PAGE = Path(__file__).parents[2] / "docs" / "case-file.md"
 CASE = """

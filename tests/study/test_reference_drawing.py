@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.body.body import joint_problem, make_body
+from palpate.body.imaged import aligned
+from palpate.case.case import Case, CaseTissue, Discrepancy, Domain, DriverMotion, Images, Mechanics, MeshSettings
 from palpate.images.segmentation import segment
 from palpate.progress import silent
-from palpate.study.body import joint_problem, make_body
-from palpate.study.case import Case, CaseTissue, Discrepancy, Domain, DriverMotion, Images, Mechanics, MeshSettings
-from palpate.study.imaged import aligned
 from palpate.unknowns import Acts
 
 DRIVER, ORGANS = "tube", ["gland", "sac"]

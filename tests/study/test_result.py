@@ -8,11 +8,11 @@ import json
 import numpy as np
 import pytest
 
+from palpate.body.provenance import input_digests, software_versions
 from palpate.errors import InputDataError, NotConverged, SolverError
 from palpate.images.tissue import Role
 from palpate.report.collect import collect_failure
-from palpate.study.provenance import input_digests, software_versions
-from palpate.study.result import MeshResult, Simulation, failure_document
+from palpate.statement.result import MeshResult, Simulation, failure_document
 from palpate.uncertainty import Covariance
 
 KEYS = {

@@ -11,6 +11,10 @@ import pytest
 import referencing
 
 import palpate
+from palpate.body.body import joint_problem, make_body
+from palpate.body.read import read_states
+from palpate.case.case_file import read_case
+from palpate.case.json_schema import SCHEMAS
 from palpate.cli import main
 from palpate.errors import EstimationError
 from palpate.images.readers import write_label_image
@@ -18,15 +22,11 @@ from palpate.inversion import REPORTED
 from palpate.mechanics.dilatation import choose_element
 from palpate.progress import silent
 from palpate.report.tornado import effect_text, sensitivity_page, sensitivity_table, tornado_rows
+from palpate.statement.variations import fast_variations
 from palpate.study import inverted as inverted_module
 from palpate.study import sensitivity as study
-from palpate.study.body import joint_problem, make_body
-from palpate.study.case_file import read_case
 from palpate.study.inverted import inverted
-from palpate.study.json_schema import SCHEMAS
-from palpate.study.read import read_states
 from palpate.study.run import inversion_settings
-from palpate.study.variations import fast_variations
 from palpate.unknowns import Choice
 
 CASE = """

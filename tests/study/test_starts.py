@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from palpate.body.refusals import refuse_what_cannot_be_estimated
+from palpate.case.case import Estimate
 from palpate.errors import ConfigurationError
-from palpate.study.case import Estimate
-from palpate.study.refusals import refuse_what_cannot_be_estimated
 from palpate.study.run import FURTHER, inversion_settings
 
 

@@ -10,7 +10,7 @@ import pytest
 from palpate.approximation import exact_approximation, reduced_basis
 from palpate.inversion import Outcome, frozen_posterior, invert
 from palpate.observation.noise_model import NoiseModel
-from palpate.study.stated_posterior import StatedPosterior, exact_at_ends, profiled
+from palpate.statement.stated_posterior import StatedPosterior, exact_at_ends, profiled
 from palpate.uncertainty import NORMAL_95, Covariance, StatedMixture, modulus_interval
 
 NOISE = NoiseModel(np.array([0.3**2]), np.array([3.0]))

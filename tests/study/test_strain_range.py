@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from palpate.body.body import Body
+from palpate.body.imaged import ImagedStates
+from palpate.body.refusals import linear_strain_warnings
+from palpate.case.case import Mechanics
 from palpate.mechanics.laws.registry import LAWS
-from palpate.study.body import Body
-from palpate.study.case import Mechanics
-from palpate.study.imaged import ImagedStates
-from palpate.study.refusals import linear_strain_warnings
 from palpate.study.run import strain_warnings
 
 

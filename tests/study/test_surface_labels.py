@@ -7,12 +7,12 @@ import json
 import numpy as np
 import pytest
 
+from palpate.body.surface_labels import surface_labels
 from palpate.cli import main
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_label_image
 from palpate.images.readers.stl import FACET
-from palpate.study.surface_labels import surface_labels
 
 LPS = np.array([-1.0, -1.0, 1.0])
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)

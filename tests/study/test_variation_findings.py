@@ -7,9 +7,9 @@ import math
 import pytest
 
 from palpate.findings import one_a_cause
-from palpate.study.estimate_findings import variation_findings
-from palpate.study.estimated import ModulusEstimate
-from palpate.study.variations import DOWN, UP, Variation, ratio_change
+from palpate.statement.estimate_findings import variation_findings
+from palpate.statement.estimated import ModulusEstimate
+from palpate.statement.variations import DOWN, UP, Variation, ratio_change
 
 
 def modulus(tissue, *, verdict="identified", interval=(16.0, 25.0), ratio_interval=(1.6, 2.5)):

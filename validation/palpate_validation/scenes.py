@@ -19,10 +19,11 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
+from palpate.body import software_versions
 from palpate.errors import ResourceError
 from palpate.parallel import processors
 from palpate.progress import Line
-from palpate.study import OutputFolder, make_folder, own_file, software_versions, write_json
+from palpate.study import OutputFolder, make_folder, own_file, write_json
 
 __all__ = ["Found", "Job", "Ledger", "Part", "Progress", "Scenes", "compute"]
 

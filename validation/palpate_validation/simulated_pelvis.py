@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
+from palpate.case import Mechanics
 from palpate.demo import DATA, FILLING_MM, LAW, TISSUES, TRUTH_EDGE_MM
 from palpate.images import (
     LabelImage,
@@ -30,7 +31,7 @@ from palpate.images import (
 )
 from palpate.mesh import LagrangeSpace, anatomy_of, check_mesh, domain_box, lagrange_space, margin_box, tetrahedralise
 from palpate.phantoms import imaged
-from palpate.study import Mechanics, filled
+from palpate.study import filled
 
 __all__ = ["MARGIN_MM", "SimulatedPelvis", "simulate_pelvis"]
 

@@ -15,7 +15,7 @@ from palpate.steps.streams import tell
 from palpate.steps.warning_lines import warning_lines
 
 if TYPE_CHECKING:
-    from palpate.study.case import Case
+    from palpate.case.case import Case
     from palpate.study.outputs import OutputFolder
 
 

@@ -22,7 +22,7 @@ from palpate.study.outputs import OutputFolder, make_folder
 
 # Heavy layers are imported by the sub-command that needs them, so that `palpate --help` answers at once.
 if TYPE_CHECKING:
-    from palpate.study.case import Case
+    from palpate.case.case import Case
 
 
 LARGEST = 2**31 - 1  # of mallopt
@@ -106,9 +106,9 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
 
     `written` gets the names of the files that take their places.
     """
+    from palpate.case.case_file import read_case
     from palpate.images.input_file import like
     from palpate.steps.display import PATIENCE_S, progress_on_stderr
-    from palpate.study.case_file import read_case
 
     command: Callable[..., Outcome] = arguments.command
     images = len(getattr(arguments, "inputs", ())) > 1  # in the place of a case
@@ -140,7 +140,7 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
 
 def _into_added_folder(arguments: argparse.Namespace) -> None:
     """Have an estimate of added images write into a folder of its own, in that of the estimate it builds on."""
-    from palpate.study.known_images import added_name
+    from palpate.statement.known_images import added_name
     from palpate.study.outputs import RESULT, read_json
 
     read_json(arguments.output / RESULT)  # before a folder is made

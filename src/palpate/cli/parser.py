@@ -12,13 +12,13 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any, NoReturn
 
+from palpate.case.schema import nearest, shown
 from palpate.cli import cohorts, commands, written
 from palpate.cli.outcome import Outcome
 from palpate.entry_points import brought
 from palpate.errors import ConfigurationError
 from palpate.export.formats import FORMATS
 from palpate.study.outputs import PAGE, RESULT
-from palpate.study.schema import nearest, shown
 
 CASE_HELP = "the case: images, tissues, roles"
 EXAMPLES = {

@@ -12,9 +12,9 @@ from palpate.steps.warning_lines import warning_lines
 from palpate.study.outputs import PAGE, RESULT, RESULT_FILES
 
 if TYPE_CHECKING:
-    from palpate.study.case import Case
+    from palpate.case.case import Case
+    from palpate.statement.result import CaseResult
     from palpate.study.outputs import OutputFolder
-    from palpate.study.result import CaseResult
 
 
 SENSITIVITY_TARGETS = ("sensitivity.json", "sensitivity.html")
@@ -23,10 +23,10 @@ TARGETS = (RESULT, *RESULT_FILES, "case.toml")
 
 def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Estimate a case, or images for which a case is written first."""
+    from palpate.case.case_file import read_case
     from palpate.steps import commands
     from palpate.steps.previewing import PREVIEW, write_page
     from palpate.steps.saving import save_failure
-    from palpate.study.case_file import read_case
     from palpate.study.earlier import refuse_other_case
     from palpate.study.new_case import write_new_case
 
@@ -56,9 +56,9 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
 
 def demo(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Estimate the example that is installed with Palpate: a pelvis with a simulated later state."""
+    from palpate.case.case_file import read_case
     from palpate.demo import DATA as IMAGES
     from palpate.demo import run_demo
-    from palpate.study.case_file import read_case
     from palpate.study.earlier import refuse_other_case
 
     del case  # it has its own

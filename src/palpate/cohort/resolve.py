@@ -10,11 +10,11 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
+from palpate.body.provenance import file_digest, software_versions
+from palpate.case.case import Case
+from palpate.case.case_file import case_tables, read_case
 from palpate.cohort.task import Row
 from palpate.errors import ConfigurationError, InputDataError, PalpateError
-from palpate.study.case import Case
-from palpate.study.case_file import case_tables, read_case
-from palpate.study.provenance import file_digest, software_versions
 
 KEPT_IMAGES = ("names", "align")  # what a template's [images] says of all rows; its images are another body's
 NOT_NUMERICAL = ("python", "matplotlib", "pydicom", "highdicom")  # versions that do not touch a number

@@ -16,13 +16,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import IO
 
+from palpate.case.case_file import case_text
 from palpate.cohort.plan import read_mark, write_mark
 from palpate.cohort.resolve import case_of, row_key
 from palpate.cohort.task import CLASS_OF_EXIT_CODE, Limits, Outcome, Task
 from palpate.errors import PalpateError
 from palpate.images.named_labels import printable
 from palpate.processes import environment_of_child, name_of_end
-from palpate.study.case_file import case_text
 from palpate.study.outputs import make_folder, write_text
 
 LOOK_S = 0.1  # how often memory is looked at

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
+from palpate.body.provenance import software_versions
 from palpate.cohort.page import cohort_page
 from palpate.cohort.plan import CASES, MARK, PLAN, Plan, make_plan, read_plan, replaced, write_plan
 from palpate.cohort.progress import Tally
@@ -19,7 +20,6 @@ from palpate.cohort.task import Limits, Outcome, Row, Task
 from palpate.errors import ConfigurationError, InputDataError, PalpateError
 from palpate.progress import Line, Progress, counted
 from palpate.study.outputs import make_folder, write_json, write_text
-from palpate.study.provenance import software_versions
 
 STATISTICS, PAGE = "statistics.json", "cohort.html"
 

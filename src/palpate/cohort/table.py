@@ -10,12 +10,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from palpate.case.schema import nearest, shortened
 from palpate.cohort.tables import COLUMNS
 from palpate.cohort.task import Row
 from palpate.errors import ConfigurationError
 from palpate.images.input_file import read_input
 from palpate.images.named_labels import MAX_NAME, computed_by_spreadsheets
-from palpate.study.schema import nearest, shortened
 
 LARGEST_FILE = 2**26  # bytes
 MOST_ROWS = 100_000

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from palpate.case.case_file import read_case
 from palpate.images import Role, Tissue
 from palpate.progress import Line, Progress
-from palpate.study import CaseResult, estimate, read_case
+from palpate.statement.result import CaseResult
+from palpate.study.run import estimate
 
 __all__ = ["DATA", "FILLING_MM", "LAW", "TISSUES", "TRUTH_EDGE_MM", "run_demo"]
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.case_loads import loads_on
 from palpate.export.conditions import prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.groups import (
@@ -30,7 +31,6 @@ from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
 from palpate.mechanics.loads import FollowingPressure, Load
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.case_loads import loads_on
 from palpate.study.outputs import write_text
 
 FACE = np.array([3, 4, 2, 1])  # Abaqus' number of each row of FACES

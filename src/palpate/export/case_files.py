@@ -24,12 +24,12 @@ from palpate.mesh.locate import tetrahedron_image
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.surface import tissue_surface
 from palpate.mesh.tet_mesh import TetMesh
+from palpate.statement.known_images import FORMAT
+from palpate.statement.result import CaseResult, MeshResult, Simulation
+from palpate.statement.samples import POSTERIOR
 from palpate.study.archive import write_archive
 from palpate.study.earlier import seal_of
-from palpate.study.known_images import FORMAT
 from palpate.study.outputs import KNOWN_IMAGES, make_folder, write_text
-from palpate.study.result import CaseResult, MeshResult, Simulation
-from palpate.study.samples import POSTERIOR
 
 MOST_BYTES = 60  # of a tissue's name in a file's: file systems count bytes, not letters
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.provenance import software_versions
 from palpate.errors import InputDataError, ResourceError
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.images.input_file import like, read_input
@@ -22,7 +23,6 @@ from palpate.images.segmentation import first_labels
 from palpate.images.tissue import tissue_colours
 from palpate.mesh.locate import modulus_image
 from palpate.study.outputs import write_bytes
-from palpate.study.provenance import software_versions
 
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset

@@ -14,6 +14,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.case_loads import loads_on
 from palpate.errors import ConfigurationError
 from palpate.export.conditions import Prescribed, prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
@@ -23,7 +24,6 @@ from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
 from palpate.mechanics.loads import FollowingPressure, Load
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.case_loads import loads_on
 from palpate.study.outputs import write_bytes
 
 Element = ET.Element

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.case.case_data import CaseLoad
 from palpate.errors import ConfigurationError, EstimationError, InputDataError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Tissue
@@ -16,10 +17,9 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import law_from
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
-from palpate.study.case_data import CaseLoad
-from palpate.study.estimated import ModulusEstimate
-from palpate.study.result import CaseResult
-from palpate.study.samples import ModulusSamples
+from palpate.statement.estimated import ModulusEstimate
+from palpate.statement.result import CaseResult
+from palpate.statement.samples import ModulusSamples
 
 HIGHEST_RATIO = 0.4999  # Poisson's, that a case may have
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from palpate.export.fitted_model import FittedModel, fitted_model
 from palpate.export.formats import Options, format_named
 from palpate.export.model_file import read_model
+from palpate.statement.result import CaseResult
 from palpate.study.earlier import refuse_any_result, seal_of
 from palpate.study.outputs import OutputFolder, make_folder
-from palpate.study.result import CaseResult
 
 PathLike = str | os.PathLike[str]
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from palpate.errors import EstimationError, InputDataError
 from palpate.export.fitted_model import FittedModel
 from palpate.images.named_labels import printable
+from palpate.statement.result import SCHEMA
 from palpate.study.archive import read_archive, write_archive
 from palpate.study.earlier import seal_of
 from palpate.study.outputs import RESULT, read_json, sha256_of
-from palpate.study.result import SCHEMA
 
 MODEL = "model.npz"
 FORMAT = "palpate.model/1"

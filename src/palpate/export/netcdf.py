@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from palpate.errors import ResourceError
 from palpate.export.fitted_model import FittedBody, FittedModel
+from palpate.statement.samples import POSTERIOR
 from palpate.study.outputs import write_bytes
-from palpate.study.samples import POSTERIOR
 
 DRAWS = 4000
 SEED = 0

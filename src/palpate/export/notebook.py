@@ -14,7 +14,7 @@ from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image, write_scalar_image
 from palpate.images.tissue import Role, tissue_colours
 from palpate.mesh.locate import modulus_image
-from palpate.study.result import CaseResult
+from palpate.statement.result import CaseResult
 
 
 def notebook_viewer(result: CaseResult, *, background: Path | None = None, opacity: float = 0.6) -> Any:

@@ -15,8 +15,8 @@ from palpate.images.readers import write_scalar_image
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import tissue_colours
 from palpate.mesh.locate import modulus_image
+from palpate.statement.stiffness_scale import StiffnessScale, stiffness_scale
 from palpate.study.outputs import write_json
-from palpate.study.stiffness_scale import StiffnessScale, stiffness_scale
 
 
 def write(model: FittedModel, body: FittedBody, folder: Path) -> None:

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from palpate.case.case import Case
 from palpate.errors import InputDataError, PalpateError
 from palpate.images.named_labels import printable
 from palpate.report.collect import collect, collect_failure
 from palpate.report.page import render
 from palpate.report.report_data import ReportData
-from palpate.study.case import Case
+from palpate.statement.result import CaseResult
 from palpate.study.earlier import seal_of
 from palpate.study.outputs import DATA, PAGE, RESULT, write_text
-from palpate.study.result import CaseResult
 
 
 def write_case_report(result: CaseResult, folder: Path) -> Path:

@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.case.case import Case
 from palpate.errors import PalpateError
 from palpate.images.distance import smoothing_width
 from palpate.images.segmentation import Segmentation
@@ -36,8 +37,7 @@ from palpate.report.report_data import (
 from palpate.report.stiffness_maps import tissue_maps
 from palpate.report.surfaces import MOST_TRIANGLES, carried_outline, image_surface, model_surface, outer_first
 from palpate.report.volume import MOVING, Grey, background, earlier_grey, later_grey, slice_box, whole_box, whole_images
-from palpate.study.case import Case
-from palpate.study.result import CaseResult, MeshSummary, failure_document, stated_unit
+from palpate.statement.result import CaseResult, MeshSummary, failure_document, stated_unit
 
 LOGGER = logging.getLogger(__name__)
 T = TypeVar("T")

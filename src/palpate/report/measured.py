@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from palpate.body.provenance import pair_names
 from palpate.report.pairs import ImagePair
 from palpate.report.report_data import (
     MOST_ARROWS,
@@ -19,9 +20,8 @@ from palpate.report.report_data import (
     SliceBox,
 )
 from palpate.report.surfaces import carried_outline
-from palpate.study.estimated import PointFit
-from palpate.study.provenance import pair_names
-from palpate.study.result import CaseResult
+from palpate.statement.estimated import PointFit
+from palpate.statement.result import CaseResult
 
 OF_BOX = 0.1  # of the slices' longest edge: how long an arrow is drawn that is longer than all but some
 USUAL = 95.0  # per cent of the arrows that are no longer than that

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import igl
 import numpy as np
 
+from palpate.body.provenance import pair_names
+from palpate.case.case_body import Images
 from palpate.images.alignment import within_border
 from palpate.images.tissue import Role
 from palpate.report.report_data import BoneDistance, InputImage, TriangleSurface
-from palpate.study.case_body import Images
-from palpate.study.provenance import pair_names
-from palpate.study.result import CaseResult
+from palpate.statement.result import CaseResult
 
 
 @dataclass(frozen=True, slots=True)

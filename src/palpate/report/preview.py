@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from palpate.body.imaged import ImagedStates
+from palpate.case.case import Case
 from palpate.errors import InputDataError
 from palpate.images.checks import VOLUME_CHANGE
 from palpate.images.registration import length_text
@@ -23,10 +25,8 @@ from palpate.report.slices import alignment_svg, first_planes, slice_svg
 from palpate.report.svg import template_of
 from palpate.report.units import shown_unit
 from palpate.report.volume import Grey, grey_of
-from palpate.study.case import Case
 from palpate.study.check import Checked, Problem
 from palpate.study.first_look import FrameLook, TissueLook, frame_look, tissue_looks
-from palpate.study.imaged import ImagedStates
 from palpate.study.prediction import Prediction
 
 GENERATOR = '<meta name="generator" content="Palpate preview">'  # by which a page of ours is known

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.imaged import ImagedStates
 from palpate.images.alignment import moved
 from palpate.images.distance import smoothing_width
 from palpate.images.segmentation import Segmentation
@@ -24,7 +25,6 @@ from palpate.report.report_data import (
 from palpate.report.surfaces import MOST_TRIANGLES, image_surface, outer_first
 from palpate.report.volume import MOST_VOXELS, Grey, grey_volume, label_volume, slice_box, whole_box
 from palpate.study.first_look import FrameLook, TissueLook
-from palpate.study.imaged import ImagedStates
 
 # One hue a role, apart on black and for the colour-blind; after Okabe & Ito, "Color Universal Design" (2008).
 ROLE_COLOURS = {"estimate": "#e69f00", "driver": "#56b4e9", "known": "#2ba888", "rigid": "#cfc8b8", "void": "#6d7278"}

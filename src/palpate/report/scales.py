@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from palpate.body.refusals import LINEAR_RANGE
 from palpate.report.report_data import LaterImage, ReportData
 from palpate.report.ticks import log_marks, mark_text
 from palpate.report.units import shown_unit
-from palpate.study.refusals import LINEAR_RANGE
-from palpate.study.stiffness_scale import COLOURS, StiffnessScale, stiffness_scale
+from palpate.statement.stiffness_scale import COLOURS, StiffnessScale, stiffness_scale
 
 MOST_TICKS = 6  # of a colour bar whose marks are moduli
 UNSEEN = (0.62, 0.63, 0.66)  # where there is no value

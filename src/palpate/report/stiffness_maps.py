@@ -23,9 +23,9 @@ from palpate.report.report_data import MapSlice, ReportData, TissueMap
 from palpate.report.scales import Scale, shown_stiffness
 from palpate.report.section import VIEWS, Plane
 from palpate.report.svg import INK, draw_svg
-from palpate.study.map_words import RESOLVED, map_words
-from palpate.study.result import CaseResult
-from palpate.study.stiffness_scale import StiffnessScale
+from palpate.statement.map_words import RESOLVED, map_words
+from palpate.statement.result import CaseResult
+from palpate.statement.stiffness_scale import StiffnessScale
 
 ROOM_MM = 3.0  # round the tissue
 COLOURS = "cividis"  # which is read alike by who sees no red or green

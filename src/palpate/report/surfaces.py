@@ -14,7 +14,7 @@ from palpate.images.segmentation import Segmentation
 from palpate.mesh.surface import tissue_surface, triangle_normals
 from palpate.observation.observed_surface import observed_surface
 from palpate.report.report_data import ModelSurface, TriangleSurface
-from palpate.study.result import CaseResult
+from palpate.statement.result import CaseResult
 
 MOST_TRIANGLES = 40_000  # of one surface
 ROOM_MM = 10.0  # around a surface, so that what lies beyond its distance map changes nothing there

@@ -14,7 +14,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from palpate.report.rows import interval_text, number
 from palpate.report.svg import INK, draw_svg, template_of
 from palpate.report.units import ModulusUnit, shown_unit
-from palpate.study.variations import NAMES, ratio_change
+from palpate.statement.variations import NAMES, ratio_change
 
 COLOURS = ("#3b7dd8", "#d9822b")  # of what lowers the modulus, and of what raises it
 WIDEST = math.log(4.0)  # of ln E on the axis: what reaches further ends in an arrow

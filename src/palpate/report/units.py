@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from palpate.study.stiffness_scale import modulus_label
+from palpate.statement.stiffness_scale import modulus_label
 from palpate.uncertainty import NORMAL_95, Interval
 from palpate.unknowns import KNOWN_MODULUS
 

@@ -19,7 +19,7 @@ from palpate.images.registration import Registration
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.report.report_data import GREY_STEPS, SliceBox, Volume
-from palpate.study.result import CaseResult
+from palpate.statement.result import CaseResult
 
 MOST_VOXELS = 2_500_000  # what a page can carry and a telephone can hold
 CT_WINDOW = (-160.0, 240.0)  # Hounsfield units in which soft tissues differ

@@ -8,18 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from palpate.case.case import Case
+from palpate.case.case_file import case_tables, read_case
 from palpate.errors import ConfigurationError, InputDataError, PalpateError
 from palpate.export.model_file import read_model
 from palpate.findings import Finding
 from palpate.progress import Line, Progress
+from palpate.statement.known_images import FORMAT, TOGETHER, Added, BuiltOn, KnownImages, why_together
+from palpate.statement.result import SCHEMA, CaseResult, json_object
 from palpate.study import run
 from palpate.study.archive import read_archive
-from palpate.study.case import Case
-from palpate.study.case_file import case_tables, read_case
 from palpate.study.earlier import CASE_NAME, seal_of
-from palpate.study.known_images import FORMAT, TOGETHER, Added, BuiltOn, KnownImages, why_together
 from palpate.study.outputs import KNOWN_IMAGES, RESULT, read_json
-from palpate.study.result import SCHEMA, CaseResult, json_object
 
 FREE = ("id", "patient", "stage", "seed")  # what the case of added images may have otherwise
 OF_IMAGES = ("before", "after", "intensities_before", "intensities_after")

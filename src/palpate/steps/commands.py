@@ -7,27 +7,27 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
+from palpate.body.surface_labels import SurfaceLabels, surface_labels
+from palpate.case.case import Case
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_label_image
 from palpate.progress import Line, Wanted
+from palpate.statement.result import SCHEMA, MeshResult, Simulation
 from palpate.steps.adding import estimate_added
 from palpate.steps.display import shown_in_python
 from palpate.steps.previewing import checked_with_page, new_case_with_page, place_page, refuse_other_page
 from palpate.steps.results import CaseResult, SavedResult
 from palpate.steps.saving import save_sensitivity
 from palpate.study import run
-from palpate.study.case import Case
 from palpate.study.check import CheckReport, check_case
 from palpate.study.earlier import refuse_other_result
 from palpate.study.new_case import NewCase
 from palpate.study.null_pair import NullPair, noise_of_drawings
 from palpate.study.outputs import RESULT, OutputFolder, read_json
-from palpate.study.result import SCHEMA, MeshResult, Simulation
 from palpate.study.sensitivity import Kept, Sensitivity
 from palpate.study.sensitivity import sensitivity as vary
 from palpate.study.simulate import simulate as simulated
-from palpate.study.surface_labels import SurfaceLabels, surface_labels
 
 PathLike = str | os.PathLike[str]
 

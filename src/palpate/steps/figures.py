@@ -14,9 +14,9 @@ from palpate.report.collect import collect
 from palpate.report.figures.every import WrittenFigure, write_figures
 from palpate.report.figures.sheet import FORMATS
 from palpate.report.report_data import ReportData
+from palpate.statement.result import SCHEMA, CaseResult
 from palpate.study.earlier import refuse_any_result
 from palpate.study.outputs import DATA, RESULT, OutputFolder, read_json
-from palpate.study.result import SCHEMA, CaseResult
 
 PathLike = str | os.PathLike[str]
 DPI = 300

@@ -8,17 +8,17 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from palpate.body.provenance import software_versions
+from palpate.case.case import Case
+from palpate.case.case_file import toml_key
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
 from palpate.images.tissue import Role
 from palpate.progress import Line, Progress, details, silent
 from palpate.report.preview import GENERATOR, preview_page
-from palpate.study.case import Case
-from palpate.study.case_file import toml_key
 from palpate.study.check import Checked, CheckReport, Problem, checked_case
 from palpate.study.new_case import NewCase, write_new_case
 from palpate.study.outputs import OutputFolder, read_regular, write_text
 from palpate.study.prediction import predicted_intervals
-from palpate.study.provenance import software_versions
 
 LOGGER = logging.getLogger(__name__)
 PREVIEW = "preview.html"

@@ -15,9 +15,9 @@ from palpate.export.notebook import notebook_viewer
 from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.progress import counted
 from palpate.report.rows import moduli_in, number
+from palpate.statement import result
 from palpate.steps.saving import save_estimate
 from palpate.steps.warning_lines import warning_lines
-from palpate.study import result
 from palpate.study.earlier import refuse_other_case
 from palpate.study.outputs import OutputFolder
 

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from palpate import report
+from palpate.case.case import Case
 from palpate.errors import EstimationError, InputDataError
 from palpate.export.case_files import write_estimate_files
 from palpate.findings import Finding, warning_rows
 from palpate.progress import Line, Progress, silent
-from palpate.study.case import Case
+from palpate.statement.result import CaseResult, failure_document
 from palpate.study.earlier import earlier_files, write_case
 from palpate.study.outputs import (
     DATA,
@@ -26,7 +27,6 @@ from palpate.study.outputs import (
     write_json,
     write_text,
 )
-from palpate.study.result import CaseResult, failure_document
 from palpate.study.sensitivity import Sensitivity
 
 LOGGER = logging.getLogger(__name__)

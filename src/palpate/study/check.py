@@ -9,6 +9,24 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from palpate.body.body import Body, cost_of_bodies, joint_problem, make_body
+from palpate.body.case_loads import load_warnings
+from palpate.body.contacts import every_finding
+from palpate.body.cost import (
+    LESS_MEMORY,
+    MEMORY_FACTOR,
+    ExpectedCost,
+    expected_cost,
+    free_memory_gb,
+    lack_of_memory,
+    machine_memory_gb,
+)
+from palpate.body.imaged import ImagedStates, LaterImage, brought
+from palpate.body.provenance import file_digest
+from palpate.body.read import measured, read_case_images, read_segmentation, read_states
+from palpate.body.refusals import refuse_lost, refuse_unmeshable, require_samples
+from palpate.case.case import Case
+from palpate.case.case_file import read_case
 from palpate.errors import PalpateError, ResourceError
 from palpate.findings import HELP, Finding, help_on, of_pair, one_a_cause, rank, with_places
 from palpate.images.checks import (
@@ -26,27 +44,8 @@ from palpate.images.registration import Registration, length_text
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.progress import Line, Progress
-from palpate.study.body import Body, cost_of_bodies, joint_problem, make_body
-from palpate.study.case import Case
-from palpate.study.case_file import read_case
-from palpate.study.case_loads import load_warnings
-from palpate.study.contacts import every_finding
-from palpate.study.cost import (
-    LESS_MEMORY,
-    MEMORY_FACTOR,
-    ExpectedCost,
-    expected_cost,
-    free_memory_gb,
-    lack_of_memory,
-    machine_memory_gb,
-)
-from palpate.study.imaged import ImagedStates, LaterImage, brought
-from palpate.study.plausibility import unit_warnings
+from palpate.statement.plausibility import unit_warnings
 from palpate.study.prediction import Prediction
-from palpate.study.provenance import file_digest
-from palpate.study.read import measured, read_case_images, read_segmentation, read_states
-from palpate.study.refusals import refuse_lost, refuse_unmeshable
-from palpate.study.samples import require_samples
 
 T = TypeVar("T")
 IMAGE = re.compile(r"'(before|after(\[\d+\])?)'")

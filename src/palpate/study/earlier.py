@@ -9,10 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from palpate.case.case import Case
+from palpate.case.case_file import case_tables, case_text, read_case, relative_path
+from palpate.case.schema import shortened
 from palpate.errors import ConfigurationError, InputDataError, PalpateError
 from palpate.findings import Finding
-from palpate.study.case import Case
-from palpate.study.case_file import case_tables, case_text, read_case, relative_path
+from palpate.statement.result import SCHEMA
 from palpate.study.outputs import (
     DOCUMENTS,
     RESULT,
@@ -25,8 +27,6 @@ from palpate.study.outputs import (
     vouched,
     write_text,
 )
-from palpate.study.result import SCHEMA
-from palpate.study.schema import shortened
 
 CASE_NAME = "case.toml"
 Digests = Mapping[str, Mapping[str, str]]  # name of a file in the folder -> {"sha256": hexadecimal}

@@ -9,12 +9,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.edge_length import case_domain
+from palpate.case.case import Case
 from palpate.images.checks import OBSERVED, share_inside
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.mesh.anatomy import Box
-from palpate.study.case import Case
-from palpate.study.edge_length import case_domain
 
 TOWARDS = (("left side", "right side"), ("back", "front"), ("feet", "head"))  # low and high end of each RAS axis
 HELD = {

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from palpate.case.case_tissue import is_tissue_name
+from palpate.case.tissue_names import found_word
 from palpate.errors import InputDataError
 from palpate.images.checks import OBSERVED
 from palpate.images.distance import window_around
@@ -16,9 +18,7 @@ from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.label_table import CLASSES
 from palpate.images.named_labels import MAX_NAME
 from palpate.images.tissue import Role
-from palpate.study.case_tissue import is_tissue_name
-from palpate.study.plausibility import TABLE, TUMOURS, usual_stiffness
-from palpate.study.tissue_names import found_word
+from palpate.statement.plausibility import TABLE, TUMOURS, usual_stiffness
 
 SURROUNDINGS = "surroundings"
 BORDER_SHARE = 0.1  # of the image's border that the body, or the air around it, covers

@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.body import Body, body_with_ratios, joint_problem, strained_body
+from palpate.body.case_loads import case_loads
+from palpate.body.poisson_ratios import sought_ratios
+from palpate.case.case import Case
 from palpate.errors import NotConverged
 from palpate.inversion import REPORTED, InverseProblem, Inversion, InversionSettings, StopRule, invert
 from palpate.mechanics.rest_state import unloaded_displacement
 from palpate.progress import Line, Progress, details, during
-from palpate.study.body import Body, body_with_ratios, joint_problem, strained_body
-from palpate.study.case import Case
-from palpate.study.case_loads import case_loads
-from palpate.study.poisson_ratios import sought_ratios
 
 ROUNDS = 6  # largest number of times that models are made at other Poisson's ratios
 PASSES = 10

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from palpate.case.case_file import relative_path, toml_key, toml_text
+from palpate.case.case_tissue import REMAINING
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.checks import EMPTIED, later_names, refuse_unit
 from palpate.images.label_image import LabelImage
@@ -17,8 +19,6 @@ from palpate.images.label_table import read_label_table
 from palpate.images.named_labels import MAX_NAME, printable
 from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.tissue import Role
-from palpate.study.case_file import relative_path, toml_key, toml_text
-from palpate.study.case_tissue import REMAINING
 from palpate.study.earlier import CASE_NAME
 from palpate.study.guess import GuessedTissue, class_names, guess_tissues, movers_of
 from palpate.study.outputs import OutputFolder, read_regular, write_bytes, write_text

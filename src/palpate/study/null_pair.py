@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.case.schema import nearest
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding, warning_rows
 from palpate.images.alignment import RigidMotion, fit_rigid_motion, moved, seen_surface, within_border
@@ -20,7 +21,6 @@ from palpate.images.segmentation import Segmentation, segment
 from palpate.images.tissue import Role, Tissue
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import FitResponse, NoiseModel, fit_noise_model
-from palpate.study.schema import nearest
 from palpate.uncertainty import NORMAL_95
 
 ALIGNMENTS = ("auto", "surfaces", "none")

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from palpate.body.body import Body, joint_problem, on_linear_elements
+from palpate.case.case import Case, Mechanics
 from palpate.inversion import first_noise_of, fit_coefficients
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Line, Progress
-from palpate.study.body import Body, joint_problem, on_linear_elements
-from palpate.study.case import Case, Mechanics
+from palpate.statement.verdicts import or_as_ratio, verdict, without_scale
 from palpate.study.run import inversion_settings
-from palpate.study.verdicts import or_as_ratio, verdict, without_scale
 from palpate.uncertainty import Interval, covariance_of, error_noise, log_interval
 from palpate.unknowns import KNOWN_MODULUS, Choice
 

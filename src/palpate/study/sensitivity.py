@@ -17,6 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.body import Body, joint_problem, make_body
+from palpate.body.edge_length import edge_length_of
+from palpate.body.provenance import software_versions
+from palpate.body.read import CaseImages, read_case_images
+from palpate.case.case import Case
+from palpate.case.case_body import LAW_NAMES
+from palpate.case.case_file import case_tables
 from palpate.errors import (
     ConfigurationError,
     EstimationError,
@@ -31,19 +38,12 @@ from palpate.inversion import Inversion, InversionSettings, StopRule
 from palpate.mechanics.dilatation import choose_element
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Line, Progress, details, silent
-from palpate.study.body import Body, joint_problem, make_body
-from palpate.study.case import Case
-from palpate.study.case_body import LAW_NAMES
-from palpate.study.case_file import case_tables
-from palpate.study.edge_length import edge_length_of
-from palpate.study.estimation import conclude
+from palpate.statement.estimation import conclude
+from palpate.statement.result import Provenance, closing, json_object
+from palpate.statement.variations import Variation, fast_variations, voxel_mm
 from palpate.study.inverted import inverted
 from palpate.study.outputs import OutputFolder, make_folder, read_json, write_json
-from palpate.study.provenance import software_versions
-from palpate.study.read import CaseImages, read_case_images
-from palpate.study.result import Provenance, closing, json_object
 from palpate.study.run import inversion_settings, observed_of
-from palpate.study.variations import Variation, fast_variations, voxel_mm
 
 KEPT = "variants"  # folder of the finished parts
 COARSER = 1.25  # times the mesh's edge length

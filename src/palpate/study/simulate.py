@@ -8,6 +8,12 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.body import Body, inverse_problem, make_body, strained_body
+from palpate.body.case_loads import case_loads
+from palpate.body.driver_fit import fit_driver
+from palpate.body.provenance import input_digests, software_versions
+from palpate.body.read import phantom_scene, read_states
+from palpate.case.case import Case, Mechanics
 from palpate.errors import ConfigurationError
 from palpate.findings import Finding
 from palpate.images.label_image import LabelImage
@@ -25,13 +31,7 @@ from palpate.mesh.voxelise import voxelise
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.phantoms.motion import wall_filling
 from palpate.progress import Line, Progress, silent
-from palpate.study.body import Body, inverse_problem, make_body, strained_body
-from palpate.study.case import Case, Mechanics
-from palpate.study.case_loads import case_loads
-from palpate.study.driver_fit import fit_driver
-from palpate.study.provenance import input_digests, software_versions
-from palpate.study.read import phantom_scene, read_states
-from palpate.study.result import MeshSummary, Provenance, Simulation
+from palpate.statement.result import MeshSummary, Provenance, Simulation
 
 
 def simulate(case: Case, *, steps: int = 1, progress: Progress = silent) -> Simulation:

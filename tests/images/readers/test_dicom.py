@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from pydicom.dataset import Dataset
 
 from dicom_files import TILTED, axes_of, ct_slices, save_contours, save_segmentation, save_series, traced
+from palpate.body.read import read_segmentation
+from palpate.case.case_file import read_case
 from palpate.errors import InputDataError, ResourceError
 from palpate.images import readers
 from palpate.images.label_image import LabelImage, VoxelGrid
-from palpate.study.case_file import read_case
-from palpate.study.read import read_segmentation
 
 read_label_image = partial(readers.read_label_image, limits=None)
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.approximation import LinearisationPoint, ReducedBasis, reduced_basis
+from palpate.case import DriverMotion
 from palpate.images import Role, Tissue
 from palpate.inversion import Bounds, InverseProblem, InversionSettings, LaterState, StopRule, invert
 from palpate.mechanics import Conditions, LinearModel, LinearSystem, linear_model, outer_constraint
@@ -23,7 +24,6 @@ from palpate.phantoms import (
     grid_box,
     smooth_field,
 )
-from palpate.study import DriverMotion
 from palpate.unknowns import parameter_map, unit_blocks
 from palpate_validation.truth import target_of_truth
 

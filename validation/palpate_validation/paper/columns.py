@@ -8,13 +8,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body import Body, ImagedStates, aligned
 from palpate.images import Role, VoxelGrid, segment
 from palpate.inversion import Bounds, Inversion, InversionSettings
 from palpate.mechanics import LinearModel
 from palpate.mesh import LagrangeSpace
 from palpate.observation import Observation, observed_surface, surface_distance
 from palpate.phantoms import imaged
-from palpate.study import Body, ImagedStates, Observed, aligned, conclude, fitted_states, verdict
+from palpate.statement import Observed, conclude, verdict
+from palpate.study import fitted_states
 from palpate.uncertainty import log_interval, sandwich_covariance
 from palpate.unknowns import ParameterMap
 from palpate_validation.paper.paper_method import paper_estimate, paper_target

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body import make_body
+from palpate.case import Case, Mechanics, MeshSettings, Phantom
 from palpate.inversion import InverseProblem, Inversion, InversionSettings, LaterState, invert
 from palpate.mechanics import Conditions, LinearModel, linear_model
 from palpate.mesh import LagrangeSpace
 from palpate.observation import Observation, observed_surface, surface_distances
-from palpate.study import Case, Mechanics, MeshSettings, Phantom, make_body
 from palpate.unknowns import parameter_map, unit_blocks
 from palpate_validation.paper.balls import (
     BODIES,

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.approximation import ReducedBasis, reduced_basis
+from palpate.body import Body, inverse_problem
+from palpate.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Phantom
 from palpate.images import VoxelGrid, observation_width, smoothing_width
 from palpate.inversion import InverseProblem, LaterState, invert
 from palpate.mechanics import (
@@ -23,16 +25,6 @@ from palpate.mechanics import (
 )
 from palpate.mesh import LagrangeSpace, anatomy_of, check_mesh, lagrange_space, tetrahedralise
 from palpate.observation import observations, prescribed_motion
-from palpate.study import (
-    Body,
-    Case,
-    Domain,
-    DriverMotion,
-    Mechanics,
-    MeshSettings,
-    Phantom,
-    inverse_problem,
-)
 from palpate.unknowns import parameter_map, unit_blocks
 from palpate_validation.paper.columns import (
     entries_by_the_paper,

@@ -17,7 +17,7 @@ from palpate.mechanics import ForwardModel, LinearModel
 from palpate.mesh import lagrange_space
 from palpate.observation import NoiseModel
 from palpate.phantoms import smooth_field
-from palpate.study import verdict
+from palpate.statement import verdict
 from palpate.uncertainty import NORMAL_95, log_interval, sandwich_covariance
 from palpate_validation.problems.concentric import SENSITIVITIES, hollow_spheres, radial
 from palpate_validation.problems.contract import Check, Problem, checked

@@ -16,7 +16,7 @@ from palpate.cohort.statistics.regression import stage_regression
 from palpate.cohort.statistics.scans import RULES, Scan, Usable, combined, inside_fences, repeatability, usable_scans
 from palpate.cohort.task import Row
 from palpate.findings import MISLEADING
-from palpate.study.result import json_object
+from palpate.statement.result import json_object
 
 SCHEMA = "palpate.statistics/1"
 SEED = 0

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from palpate.case.case_tissue import refuse_name
+from palpate.case.schema import rule
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.laws.registry import LAWS
-from palpate.study.case_tissue import refuse_name
-from palpate.study.schema import rule
 
 AUTO = "auto"
 SURFACE_ROLES = {  # of what lies behind a surface of a mesh

@@ -8,6 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.imaged import ImagedStates, LaterImage
+from palpate.case.case import Case
+from palpate.case.case_body import MeshBody
+from palpate.case.case_tissue import REMAINING, CaseTissue
+from palpate.case.schema import nearest, shown
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding
 from palpate.images.label_image import VoxelGrid
@@ -24,11 +29,6 @@ from palpate.mesh.voxelise import voxelise
 from palpate.observation.measured_motion import MeasuredMotion
 from palpate.observation.measured_points import MeasuredPoints
 from palpate.progress import Progress
-from palpate.study.case import Case
-from palpate.study.case_body import MeshBody
-from palpate.study.case_tissue import REMAINING, CaseTissue
-from palpate.study.imaged import ImagedStates, LaterImage
-from palpate.study.schema import nearest, shown
 
 OUTSIDE = "outside"
 USUAL_MM = (2.0, 3e3)  # the length of a body: one in metres, or in micrometres, lies outside

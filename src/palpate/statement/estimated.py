@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate
 from palpate.findings import Finding
 from palpate.inversion import EarlierImages
 from palpate.observation.contract import Fit, PointMotions
-from palpate.study.discrepancy import FittedMaterial, FoundDiscrepancy
-from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate
-from palpate.study.samples import ModulusSamples
-from palpate.study.together import ImagePairs, ModulusRegion
-from palpate.study.variations import Variation
+from palpate.statement.discrepancy import FittedMaterial, FoundDiscrepancy
+from palpate.statement.samples import ModulusSamples
+from palpate.statement.together import ImagePairs, ModulusRegion
+from palpate.statement.variations import Variation
 from palpate.uncertainty import Combination, Covariance, Information, Interval, StiffnessMap
 
 

@@ -13,9 +13,9 @@ from palpate.images.checks import later_names
 from palpate.inversion import Inversion
 from palpate.mechanics.element import deformation_determinants
 from palpate.observation.contract import OfInstrument
-from palpate.study.estimated import ModulusEstimate
-from palpate.study.together import ImagePairs
-from palpate.study.variations import NAMES, Variation, ratio_change
+from palpate.statement.estimated import ModulusEstimate
+from palpate.statement.together import ImagePairs
+from palpate.statement.variations import NAMES, Variation, ratio_change
 from palpate.uncertainty import FittedState
 
 STRONG_CORRELATION = 0.99

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from palpate.case.schema import rule
 from palpate.errors import ConfigurationError
 from palpate.observation.contract import DataFile
 from palpate.observation.registry import SOURCES, register_brought
-from palpate.study.schema import rule
 
 Row = tuple[float, float, float]
 FORCES_N = (-1e9, 1e9)

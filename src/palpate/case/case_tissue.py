@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from palpate.case.schema import nearest, rule, shown
 from palpate.errors import ConfigurationError
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME, computed_by_spreadsheets
 from palpate.images.tissue import FieldPrior, Role, Tissue
-from palpate.study.schema import nearest, rule, shown
 from palpate.uncertainty.intervals import NORMAL_95
 
 REMAINING = "remaining"

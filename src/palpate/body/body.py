@@ -9,6 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.case_loads import case_loads
+from palpate.body.cost import ExpectedCost, cost_of_meshes
+from palpate.body.edge_length import EdgeLength
+from palpate.body.imaged import ImagedStates
+from palpate.body.meshing import ReferenceMesh, mesh_reference
+from palpate.body.poisson_ratios import sought_priors, with_ratios
+from palpate.body.refusals import NOTHING_MOVES
+from palpate.case.case import Case
 from palpate.errors import ConfigurationError
 from palpate.findings import Finding
 from palpate.images.distance import observation_width
@@ -34,14 +42,6 @@ from palpate.observation.prescribed_motion import FrameMotion, PrescribedMotion,
 from palpate.observation.registry import observations
 from palpate.observation.surface_distance import SurfaceDistance
 from palpate.progress import Line, Progress, grouped
-from palpate.study.case import Case
-from palpate.study.case_loads import case_loads
-from palpate.study.cost import ExpectedCost, cost_of_meshes
-from palpate.study.edge_length import EdgeLength
-from palpate.study.imaged import ImagedStates
-from palpate.study.meshing import ReferenceMesh, mesh_reference
-from palpate.study.poisson_ratios import sought_priors, with_ratios
-from palpate.study.refusals import NOTHING_MOVES
 from palpate.unknowns import (
     Block,
     frame_blocks,

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binom, chi2
 
+from palpate.body.poisson_ratios import PoissonRatioEstimate
 from palpate.findings import Finding
 from palpate.images.tissue import Tissue
 from palpate.inversion import Linearisation
 from palpate.observation.contract import Imaged, OfInstrument, OfPoints, PointMotions
-from palpate.study.estimated import ModulusEstimate, PointFit
-from palpate.study.poisson_ratios import PoissonRatioEstimate
+from palpate.statement.estimated import ModulusEstimate, PointFit
 
 T = TypeVar("T", ModulusEstimate, PoissonRatioEstimate)
 

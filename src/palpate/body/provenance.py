@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 
+from palpate.case.case import Case
 from palpate.errors import InputDataError
 from palpate.images.input_file import open_input
-from palpate.study.case import Case
 
 PACKAGES = (
     "palpate",

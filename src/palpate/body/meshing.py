@@ -6,6 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from palpate.body.cost import expected_cost, lack_of_memory
+from palpate.body.edge_length import EdgeLength, case_domain, edge_length_of
+from palpate.case.case import Case
 from palpate.errors import GeometryError, ResourceError
 from palpate.findings import Finding
 from palpate.images.distance import smoothing_width
@@ -15,9 +18,6 @@ from palpate.mesh.quality import MeshQuality, check_mesh
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.mesh.tetrahedralise import tetrahedralise
 from palpate.progress import Progress
-from palpate.study.case import Case
-from palpate.study.cost import expected_cost, lack_of_memory
-from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of
 
 FINER = 0.75  # factor on an edge length whose mesh fails, for the next attempt
 FINER_MESHES = 2  # largest number of further attempts

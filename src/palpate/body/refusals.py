@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from itertools import product
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from palpate.body.cost import image_memory_gb, machine_memory_gb
+from palpate.case.case import Case
 from palpate.errors import ConfigurationError, GeometryError, InputDataError, ResourceError
 from palpate.findings import Finding
 from palpate.images.alignment import Motion
@@ -20,8 +23,6 @@ from palpate.images.tissue import Role
 from palpate.mechanics.element import largest_strains
 from palpate.mechanics.laws.contract import Law
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.case import Case
-from palpate.study.cost import image_memory_gb, machine_memory_gb
 
 ORGANS, MESHED = (Role.ESTIMATE, Role.DRIVER), (Role.ESTIMATE, Role.KNOWN)
 LINEAR_RANGE = 0.10  # principal strain beyond which the neglected squares are over a tenth of it
@@ -57,6 +58,20 @@ def refuse_what_cannot_be_estimated(case: Case) -> None:
         raise ConfigurationError(
             f"no surface of the mesh is called '{lost[0]}'; those that can be loaded are {sorted(surfaces)} and 'outer'"
         )
+
+
+def require_samples(case: Case) -> None:
+    """Raise `ResourceError` where the case asks for samples and a library for their file is not installed."""
+    if not case.estimate.samples:
+        return
+    try:
+        for name in ("h5py", "h5netcdf"):
+            import_module(name)
+    except ImportError as error:
+        raise ResourceError(
+            "posterior.nc is written by h5netcdf, which is not installed: pip install 'palpate[samples]'; the estimate"
+            " itself works without --samples ([estimate] samples = 0)"
+        ) from error
 
 
 def refuse_still(case: Case, *pairs: tuple[Segmentation, Sequence[Mapping[int, Motion]]]) -> None:

@@ -9,6 +9,8 @@ from itertools import count
 
 import numpy as np
 
+from palpate.body.contacts import every_finding
+from palpate.body.refusals import refuse_lost, refuse_unmeshable
 from palpate.errors import InputDataError
 from palpate.findings import Finding, listing, some
 from palpate.images.alignment import Alignment, Motion, align, moved
@@ -20,8 +22,6 @@ from palpate.images.tissue import Role
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import DataSource
 from palpate.progress import Progress, silent
-from palpate.study.contacts import every_finding
-from palpate.study.refusals import refuse_lost, refuse_unmeshable
 
 SMALL_FRAME_MOTION = 1.0 / 3.0  # of the organs' relative motion: a smaller motion of the frame is not reported
 LEVER_MM = 25.0  # about an organ's size: the lever that turns a rotation into a motion

@@ -11,12 +11,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from palpate.case.case import Case
+from palpate.case.case_tissue import POISSON_RATIO, CaseTissue
+from palpate.case.schema import Rule, read_table, shortened
 from palpate.errors import ConfigurationError
 from palpate.images.input_file import read_input
 from palpate.images.named_labels import printable
-from palpate.study.case import Case
-from palpate.study.case_tissue import POISSON_RATIO, CaseTissue
-from palpate.study.schema import Rule, read_table, shortened
 
 LARGEST_FILE = 100_000  # bytes; a case is a page of text, and one of a hundred tissues has 40 000
 MOST_DOTS = 100  # in a line: keys of thousands of parts would take the parser minutes

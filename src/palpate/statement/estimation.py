@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.poisson_ratios import NOT_IDENTIFIED, ratios_of
 from palpate.images.checks import later_names
 from palpate.inversion import (
     EarlierImages,
@@ -21,23 +22,22 @@ from palpate.inversion import (
 from palpate.mesh.voxelise import voxelise
 from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, seen_by
 from palpate.progress import Progress, silent
-from palpate.study.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of, fitted_materials
-from palpate.study.estimate_findings import (
+from palpate.statement.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of, fitted_materials
+from palpate.statement.estimate_findings import (
     data_findings,
     fold_findings,
     inversion_findings,
     pair_findings,
     variation_findings,
 )
-from palpate.study.estimated import Estimation, ForceFit, Iteration, PointFit, Start, StatedExplanation, TissueFit
-from palpate.study.map_words import map_findings
-from palpate.study.misfit import beside_misfits, misfits_of
-from palpate.study.poisson_ratios import NOT_IDENTIFIED, ratios_of
-from palpate.study.samples import draw_moduli
-from palpate.study.stated_posterior import StatedPosterior, as_stated
-from palpate.study.together import combinations_of, image_pairs_of, regions_of
-from palpate.study.variations import Variation
-from palpate.study.verdicts import IDENTIFIED, estimates_of, intervals_of
+from palpate.statement.estimated import Estimation, ForceFit, Iteration, PointFit, Start, StatedExplanation, TissueFit
+from palpate.statement.map_words import map_findings
+from palpate.statement.misfit import beside_misfits, misfits_of
+from palpate.statement.samples import draw_moduli
+from palpate.statement.stated_posterior import StatedPosterior, as_stated
+from palpate.statement.together import combinations_of, image_pairs_of, regions_of
+from palpate.statement.variations import Variation
+from palpate.statement.verdicts import IDENTIFIED, estimates_of, intervals_of
 from palpate.uncertainty import (
     GRID_DRAWS,
     Covariance,

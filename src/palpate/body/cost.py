@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy import ndimage
 
+from palpate.body.edge_length import EdgeLength, case_domain, edge_length_of
+from palpate.case.case import Case
 from palpate.errors import ResourceError
 from palpate.images.distance import REACH_MM, window_around
 from palpate.images.segmentation import Segmentation
@@ -19,8 +21,6 @@ from palpate.mesh import SizeField, TetMesh
 from palpate.parallel import processors
 from palpate.processes import available_memory, total_memory
 from palpate.progress import STAGES, Stage, about, counted
-from palpate.study.case import Case
-from palpate.study.edge_length import EdgeLength, case_domain, edge_length_of
 
 MEMORY_FACTOR = 1.5  # factor by which the predicted memory may be wrong
 

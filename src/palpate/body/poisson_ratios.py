@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from palpate.case.case import Case
 from palpate.images.tissue import Role, Tissue
 from palpate.inversion import Inversion
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.case import Case
 from palpate.uncertainty import NORMAL_95, Covariance, Interval
 
 NOT_IDENTIFIED = "not identified"  # the verdict of what has no interval

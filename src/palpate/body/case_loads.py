@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.case.case import Case
+from palpate.case.case_data import CaseLoad
 from palpate.errors import ConfigurationError
 from palpate.findings import Finding
 from palpate.images.tissue import Role
 from palpate.mechanics.loads import Load, boundary_named, gravity, pressure, traction
 from palpate.mesh.space import LagrangeSpace
-from palpate.study.case import Case
-from palpate.study.case_data import CaseLoad
 
 
 def case_loads(case: Case, space: LagrangeSpace, state: int, *, share: float = 1.0) -> tuple[Load, ...]:

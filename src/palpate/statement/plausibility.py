@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
+from palpate.body.poisson_ratios import NOT_IDENTIFIED
+from palpate.case.case import Case
+from palpate.case.tissue_names import found_word
 from palpate.findings import Finding
 from palpate.images.tissue import Role
-from palpate.study.case import Case
-from palpate.study.estimated import Estimation
-from palpate.study.poisson_ratios import NOT_IDENTIFIED
-from palpate.study.tissue_names import found_word
+from palpate.statement.estimated import Estimation
 from palpate.uncertainty import NORMAL_95
 
 MARGIN = 3.0  # methods differ by ten to a hundred times: an estimate is doubtful only well outside what was published
@@ -50,7 +50,7 @@ class PublishedStiffness:
         return f"{self.method}; {self.source}"
 
 
-TABLE: dict[str, list[dict[str, Any]]] = tomllib.loads((files("palpate.study") / "tissues.toml").read_text("utf-8"))
+TABLE: dict[str, list[dict[str, Any]]] = tomllib.loads((files("palpate.statement") / "tissues.toml").read_text("utf-8"))
 PUBLISHED = tuple(PublishedStiffness(**entry) for entry in TABLE["published"])
 TUMOURS = tuple(word for entry in TABLE["role"] if entry.get("tumour") for word in entry["words"].split())
 

@@ -11,6 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.body.edge_length import EdgeLength
+from palpate.body.imaged import LaterImage
+from palpate.body.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
+from palpate.body.provenance import image_names
+from palpate.case.case import Case
+from palpate.case.case_file import case_tables
+from palpate.case.case_tissue import CaseTissue
 from palpate.errors import NotConverged, PalpateError
 from palpate.findings import Finding, one_a_cause, warning_rows
 from palpate.images.label_image import LabelImage
@@ -19,17 +26,10 @@ from palpate.images.tissue import Role, Tissue
 from palpate.mesh.quality import MeshQuality
 from palpate.mesh.space import LagrangeSpace
 from palpate.progress import counted, grouped
-from palpate.study.case import Case
-from palpate.study.case_file import case_tables
-from palpate.study.case_tissue import CaseTissue
-from palpate.study.discrepancy import FoundDiscrepancy
-from palpate.study.edge_length import EdgeLength
-from palpate.study.estimated import Estimation, ModulusEstimate, StatedExplanation, no_estimate
-from palpate.study.imaged import LaterImage
-from palpate.study.known_images import BuiltOn, KnownImages
-from palpate.study.map_words import map_words
-from palpate.study.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
-from palpate.study.provenance import image_names
+from palpate.statement.discrepancy import FoundDiscrepancy
+from palpate.statement.estimated import Estimation, ModulusEstimate, StatedExplanation, no_estimate
+from palpate.statement.known_images import BuiltOn, KnownImages
+from palpate.statement.map_words import map_words
 from palpate.uncertainty import StiffnessMap
 
 SCHEMA = "palpate.result/1"

@@ -5,13 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from palpate.errors import ConfigurationError
-from palpate.images.tissue import Role, Tissue
-from palpate.mechanics.laws.contract import Law
-from palpate.mechanics.laws.registry import law_from, law_parameters
-from palpate.mechanics.solvers.registry import SOLVERS
-from palpate.observation.contract import DataFile
-from palpate.study.case_body import (
+from palpate.case.case_body import (
     AUTO,
     LAW_NAMES,
     SEED,
@@ -23,9 +17,15 @@ from palpate.study.case_body import (
     Pair,
     Phantom,
 )
-from palpate.study.case_data import CaseData, CaseLoad
-from palpate.study.case_tissue import KILOPASCALS, REMAINING, CaseTissue, refuse_name
-from palpate.study.schema import rule, shown
+from palpate.case.case_data import CaseData, CaseLoad
+from palpate.case.case_tissue import KILOPASCALS, REMAINING, CaseTissue, refuse_name
+from palpate.case.schema import rule, shown
+from palpate.errors import ConfigurationError
+from palpate.images.tissue import Role, Tissue
+from palpate.mechanics.laws.contract import Law
+from palpate.mechanics.laws.registry import law_from, law_parameters
+from palpate.mechanics.solvers.registry import SOLVERS
+from palpate.observation.contract import DataFile
 
 HELD = ("fixed", "sliding")  # outer boundaries that leave a body no rigid motion
 SOLVER_NAMES = ("auto", *SOLVERS)

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.case.case import Case
 from palpate.errors import ConfigurationError
 from palpate.inversion import EarlierImages, InverseProblem, InversionSettings
 from palpate.mesh.tet_mesh import TetMesh
-from palpate.study.case import Case
 
 FORMAT = "palpate.known-images/1"
 LEAST = 2  # later images from which the drawing of the reference image is an unknown, which later ones share

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage
 
+from palpate.case.case import Case
 from palpate.images.distance import window_around
 from palpate.images.segmentation import Segmentation
 from palpate.images.tissue import Role
 from palpate.mechanics.dilatation import choose_element
 from palpate.mesh.anatomy import Box, domain_box, margin_box
-from palpate.study.case import Case
 
 ACROSS_BALL = {Role.ESTIMATE: 5.0, Role.DRIVER: 4.0}  # edges across a ball of the tissue's volume
 ACROSS_THIN = 2.5  # edges across its thickness

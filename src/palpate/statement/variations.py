@@ -16,7 +16,7 @@ from palpate.mechanics.dilatation import Dilatation
 from palpate.mechanics.laws.contract import Law
 from palpate.observation.contract import Imaged, OfMaterial
 from palpate.parallel import mapped
-from palpate.study.stated_posterior import StatedPosterior
+from palpate.statement.stated_posterior import StatedPosterior
 from palpate.uncertainty import (
     Equilibria,
     Errors,

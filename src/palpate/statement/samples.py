@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.errors import ResourceError
-from palpate.study.case import Case
 from palpate.uncertainty import Interval, Marginal, StatedMixture
 from palpate.unknowns import ParameterMap
 
@@ -44,20 +41,6 @@ class ModulusSamples:
             "interval_probability": 1.0 - 2.0 * TAIL,
             "moduli": rows,
         }
-
-
-def require_samples(case: Case) -> None:
-    """Raise `ResourceError` where the case asks for samples and a library for their file is not installed."""
-    if not case.estimate.samples:
-        return
-    try:
-        for name in ("h5py", "h5netcdf"):
-            import_module(name)
-    except ImportError as error:
-        raise ResourceError(
-            f"{POSTERIOR} is written by h5netcdf, which is not installed: pip install 'palpate[samples]'; the estimate"
-            " itself works without --samples ([estimate] samples = 0)"
-        ) from error
 
 
 def draw_moduli(

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from palpate.body.poisson_ratios import NOT_IDENTIFIED, not_converged
 from palpate.inversion import Inversion, InversionSettings
-from palpate.study.estimated import ModulusEstimate, no_estimate
-from palpate.study.poisson_ratios import NOT_IDENTIFIED, not_converged
-from palpate.study.stated_posterior import StatedPosterior
+from palpate.statement.estimated import ModulusEstimate, no_estimate
+from palpate.statement.stated_posterior import StatedPosterior
 from palpate.uncertainty import (
     NORMAL_95,
     Covariance,

@@ -8,6 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from palpate.body.imaged import ImagedStates, aligned
+from palpate.body.meshed_body import mesh_states, with_prescribed
+from palpate.body.provenance import file_digest, input_digests
+from palpate.body.refusals import refuse_large, refuse_still, refuse_what_cannot_be_estimated, require_samples
+from palpate.case.case import Case
+from palpate.case.case_body import ImagePair
+from palpate.case.schema import nearest, shown
 from palpate.errors import ConfigurationError
 from palpate.images.body_in_ct import outside_body
 from palpate.images.label_table import read_label_table
@@ -21,14 +28,6 @@ from palpate.phantoms.pelvis import PelvisOptions, pelvis, pelvis_anatomy
 from palpate.phantoms.scene import Scene
 from palpate.phantoms.spheres import SpheresOptions, spheres, spheres_anatomy
 from palpate.progress import Progress, silent
-from palpate.study.case import Case
-from palpate.study.case_body import ImagePair
-from palpate.study.imaged import ImagedStates, aligned
-from palpate.study.meshed_body import mesh_states, with_prescribed
-from palpate.study.provenance import file_digest, input_digests
-from palpate.study.refusals import refuse_large, refuse_still, refuse_what_cannot_be_estimated
-from palpate.study.samples import require_samples
-from palpate.study.schema import nearest, shown
 
 
 @dataclass(frozen=True, slots=True)

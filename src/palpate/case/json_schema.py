@@ -11,13 +11,13 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from palpate.case.case import Case
+from palpate.case.case_tissue import CaseTissue
+from palpate.case.schema import MOST_LETTERS, Rule
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME
-from palpate.study.case import Case
-from palpate.study.case_tissue import CaseTissue
-from palpate.study.schema import MOST_LETTERS, Rule
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-SCHEMAS = resources.files("palpate.study") / "schemas"  # case, result and sensitivity, as they are shipped
+SCHEMAS = resources.files("palpate.case") / "schemas"  # case, result and sensitivity, as they are shipped
 LABEL = {
     "description": "an integer, a list of integers, a name of the label table, or 'remaining'",
     "oneOf": [

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from palpate.inversion import Bounds, Inversion, Posterior
 from palpate.parallel import mapped
-from palpate.study.stated_posterior import StatedPosterior
+from palpate.statement.stated_posterior import StatedPosterior
 from palpate.uncertainty import (
     NORMAL_95,
     Combination,
