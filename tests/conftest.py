@@ -17,7 +17,7 @@ import pytest
 
 from palpate.body.imaged import LaterImage
 from palpate.case.case import Case, CaseTissue, Estimate, Images
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.errors import PalpateError
 from palpate.findings import MOST_WORDS, SENTENCE_END, Finding, words_in
 from palpate.images.label_image import LabelImage, VoxelGrid
@@ -30,7 +30,7 @@ from palpate.mesh.tetrahedralise import boundary_of
 from palpate.observation.contract import Fit
 from palpate.progress import silent
 from palpate.report import render
-from palpate.statement.estimated import Estimation, Iteration, ModulusEstimate, Start, StatedExplanation, TissueFit
+from palpate.statement.estimation import Estimation, Iteration, ModulusEstimate, Start, StatedExplanation, TissueFit
 from palpate.statement.result import CaseResult, MeshSummary, PairResult, Provenance
 from palpate.statement.samples import ModulusSamples
 from palpate.study import run

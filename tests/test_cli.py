@@ -15,7 +15,7 @@ import warnings
 import pytest
 
 from palpate import errors
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.cli import main
 from palpate.cli.parser import EXAMPLES, make_parser
 from palpate.images.label_image import LabelImage

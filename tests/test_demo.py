@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.cli import main
 from palpate.demo import DATA, run_demo
 from palpate.progress import STAGES, Forecast, Line, Told

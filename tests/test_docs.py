@@ -15,7 +15,7 @@ from markdown_it import MarkdownIt
 
 import palpate
 from palpate.case.case import CaseSurface, Domain, DriverMotion, Estimate, Mechanics, MeshSettings
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.findings import CODES, HARMLESS, MISLEADING, WIDENING
 from palpate.mechanics.laws.registry import law_parameters
 

@@ -35,7 +35,7 @@ DATA = SourceKind(lambda file: None, needs=("file",), may_have=())
 READ = """
 from pathlib import Path
 from palpate.images import read_label_image
-from palpate.case.case_data import SOURCES
+from palpate.case.data import SOURCES
 print(read_label_image(Path("a.toy")).labels.sum(), "toy" in SOURCES, "landmarks" in SOURCES)
 """
 REFUSED = """

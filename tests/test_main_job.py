@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import referencing
 
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.case.json_schema import SCHEMAS
 from palpate.cli import main
 from palpate.export.model_file import read_model

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from palpate.case.case import Case as Case
-    from palpate.case.case_file import read_case as read_case
+    from palpate.case.file import read_case as read_case
     from palpate.export.folder import export as export
     from palpate.steps.commands import check as check
     from palpate.steps.commands import estimate as estimate

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.demo import DATA, LAW
 from palpate.images.tissue import Role
 

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 import palpate
 from bodies import with_first_pair
 from dicom_files import PLANTED, TILTED, ct_slices, save_series
-from palpate.body.case_loads import loads_on
+from palpate.body.loads import loads_on
 from palpate.case.case import CaseLoad
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.export import abaqus, febio

@@ -9,7 +9,7 @@ import tomllib
 
 import pytest
 
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.cli import main
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from children import in_a_child
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.cli import main
 from palpate.errors import ResourceError
 from palpate.export.case_files import file_name
@@ -142,7 +142,7 @@ def test_a_case_leads_to_its_images_from_wherever_it_lies(images, tmp_path):
 AS_NOBODY = """
 import os, sys
 from palpate.cli import main
-import palpate.cli.entry, palpate.steps.display, palpate.study.new_case, palpate.case.case_file, scipy.linalg
+import palpate.cli.entry, palpate.steps.display, palpate.study.new_case, palpate.case.file, scipy.linalg
 os.getuid() or os.setuid(65534)
 sys.exit(main(sys.argv[1:]))
 """

@@ -16,7 +16,8 @@ from palpate.cohort import charts as cohort_charts
 from palpate.report import charts, tornado
 from palpate.report.collect import collect
 from palpate.report.svg import STYLE
-from palpate.statement.together import ImagePairs, ModulusRegion, PairAlone
+from palpate.statement.image_pairs import ImagePairs, PairAlone
+from palpate.statement.joint import ModulusRegion
 from palpate.statement.variations import Variation
 
 TURN = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)

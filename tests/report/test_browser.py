@@ -22,7 +22,7 @@ from palpate.report.case_report import write_case_report
 from palpate.report.collect import collect
 from palpate.report.preview import preview_page
 from palpate.report.scales import modulus_scale
-from palpate.statement.estimated import PointFit
+from palpate.statement.estimation import PointFit
 from palpate.study.check import Checked, CheckReport
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no playwright; pip install palpate[browser]")

@@ -29,7 +29,8 @@ from palpate.report.collect import MOST_LATER, collect
 from palpate.report.page import render
 from palpate.report.pairs import drawn_images
 from palpate.report.rows import explanation_rows, number
-from palpate.statement.together import ImagePairs, ModulusRegion, PairAlone
+from palpate.statement.image_pairs import ImagePairs, PairAlone
+from palpate.statement.joint import ModulusRegion
 from palpate.statement.variations import Variation
 
 EVIL = '</script><img src=x onerror=alert(1)>$\\frac{"&'

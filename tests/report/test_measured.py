@@ -13,7 +13,7 @@ import matplotlib.image as mpimg
 import numpy as np
 import pytest
 
-from palpate.case.case_data import CaseData
+from palpate.case.data import CaseData
 from palpate.observation.contract import PointMotions
 from palpate.report.collect import collect
 from palpate.report.measured import evenly, measured_points, nice_factor
@@ -21,7 +21,7 @@ from palpate.report.page import render
 from palpate.report.payload import payload
 from palpate.report.render import Arrows, Camera, Triangles, render_png
 from palpate.report.report_data import MOST_ARROWS, ReportData
-from palpate.statement.estimated import ForceFit, PointFit
+from palpate.statement.estimation import ForceFit, PointFit
 
 EVIL = '</script><img src=x onerror=alert(1)>$\\frac{"&'
 rng = np.random.default_rng(3)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from palpate.case.case import CaseLoad, Mechanics, MeshBody
-from palpate.case.case_data import CaseData
+from palpate.case.data import CaseData
 from palpate.report.collect import collect
 from palpate.report.methods import SOURCES, bibtex, methods_text, reference_line
 

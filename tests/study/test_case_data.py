@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from palpate.case.case import DriverMotion, MeshSettings
-from palpate.case.case_data import CaseData
-from palpate.case.case_file import read_case
+from palpate.case.data import CaseData
+from palpate.case.file import read_case
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image

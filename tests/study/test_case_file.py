@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from palpate.case.case import SOLVER_NAMES
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
 from palpate.mechanics.solvers.registry import SOLVERS

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.case.case import CaseLoad
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.errors import ConfigurationError
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.readers import write_label_image

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from palpate.case.case_file import case_tables, case_text, read_case
+from palpate.case.file import case_tables, case_text, read_case
 from palpate.errors import ConfigurationError
 
 TISSUES = """

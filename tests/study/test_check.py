@@ -9,7 +9,7 @@ import pytest
 
 from palpate.body import cost
 from palpate.body.cost import expected_cost, expected_tets
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.cli import main
 from palpate.errors import ResourceError
 from palpate.images.readers import write_label_image

@@ -8,7 +8,7 @@ import pytest
 
 import palpate
 from bodies import box_cells
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.errors import ConfigurationError, NotConverged
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.boundary import outer_constraint

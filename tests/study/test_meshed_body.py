@@ -15,10 +15,10 @@ import palpate
 from bodies import box_cells
 from mesh_writers import abaqus, block, gmsh_2, gmsh_4, numbered
 from palpate.body.body import inverse_problem, make_body
-from palpate.body.case_loads import case_loads
 from palpate.body.cost import expected_cost
+from palpate.body.loads import case_loads
 from palpate.body.read import read_states
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.cli import main
 from palpate.errors import ConfigurationError, GeometryError, InputDataError
 from palpate.export.fitted_model import fitted_model

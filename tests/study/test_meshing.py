@@ -11,7 +11,7 @@ from palpate.body.body import make_body
 from palpate.body.edge_length import EdgeLength
 from palpate.body.imaged import ImagedStates
 from palpate.body.meshing import mesh_reference
-from palpate.case.case_file import case_text
+from palpate.case.file import case_text
 from palpate.errors import GeometryError, MeshQualityError
 from palpate.images.label_image import LabelImage
 from palpate.images.readers import write_label_image

@@ -15,7 +15,7 @@ from palpate.observation.contract import DataFile, Fit, Residuals, Weighting
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.point_displacement import point_displacement
 from palpate.observation.robust_loss import PowerLaw
-from palpate.statement.estimated import PointFit
+from palpate.statement.estimation import PointFit
 from palpate.statement.misfit import beside_misfits, misfits_of
 
 SD, MOST_ALARMS = 0.1, 0.01

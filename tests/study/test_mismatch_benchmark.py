@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.images.readers import read_label_image
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"

@@ -11,7 +11,7 @@ import pytest
 
 from palpate.body.cost import expected_cost
 from palpate.body.read import read_segmentation, read_states
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.cli import main
 from palpate.demo import DATA
 from palpate.errors import ConfigurationError, InputDataError

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.case.tissue_names import found_word
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.label_image import LabelImage, VoxelGrid

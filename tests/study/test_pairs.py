@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from palpate.body.read import read_pairs
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.cli import main
 from palpate.errors import ConfigurationError
 from palpate.images.readers import write_label_image

@@ -8,7 +8,7 @@ import inspect
 import pytest
 
 from palpate.body import read
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.errors import ConfigurationError
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.phantoms.scene import make_scene

@@ -23,7 +23,7 @@ from palpate.body.poisson_ratios import (
     with_ratios,
 )
 from palpate.case.case import Estimate
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.case.json_schema import SCHEMAS
 from palpate.cli import main
 from palpate.cli.outcome import estimates_table

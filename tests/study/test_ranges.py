@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from palpate.case.case import Case, CaseTissue
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.case.schema import Rule, rule
 from palpate.errors import ConfigurationError
 from palpate.images.named_labels import MAX_LABEL

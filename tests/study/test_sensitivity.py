@@ -13,7 +13,7 @@ import referencing
 import palpate
 from palpate.body.body import joint_problem, make_body
 from palpate.body.read import read_states
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.case.json_schema import SCHEMAS
 from palpate.cli import main
 from palpate.errors import EstimationError
@@ -23,9 +23,9 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.progress import silent
 from palpate.report.tornado import effect_text, sensitivity_page, sensitivity_table, tornado_rows
 from palpate.statement.variations import fast_variations
-from palpate.study import inverted as inverted_module
+from palpate.study import invert_case as inverted_module
 from palpate.study import sensitivity as study
-from palpate.study.inverted import inverted
+from palpate.study.case_inversion import invert_case
 from palpate.study.run import inversion_settings
 from palpate.unknowns import Choice
 
@@ -208,7 +208,7 @@ def test_a_surface_whose_drawing_is_an_unknown_is_not_moved_beside_it(case_file)
     body = make_body(read_states(case, progress=silent), case, progress=silent)
     problem = joint_problem((body,), case, progress=silent)
     settings = inversion_settings(case, problem.parameters)
-    inversion = inverted((body,), problem, case, settings, progress=silent)
+    inversion = invert_case((body,), problem, case, settings, progress=silent)
     tissues, linear = body.space.mesh.tissues, choose_element("P1").dilatation
     sought = {block.of for block in problem.parameters.blocks if block.choice is Choice.DRAWING}
     assert sought

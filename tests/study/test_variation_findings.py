@@ -8,7 +8,7 @@ import pytest
 
 from palpate.findings import one_a_cause
 from palpate.statement.estimate_findings import variation_findings
-from palpate.statement.estimated import ModulusEstimate
+from palpate.statement.estimation import ModulusEstimate
 from palpate.statement.variations import DOWN, UP, Variation, ratio_change
 
 

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.body.case_loads import case_loads
 from palpate.body.cost import ExpectedCost, cost_of_meshes
 from palpate.body.edge_length import EdgeLength
 from palpate.body.imaged import ImagedStates
+from palpate.body.loads import case_loads
 from palpate.body.meshing import ReferenceMesh, mesh_reference
 from palpate.body.poisson_ratios import sought_priors, with_ratios
 from palpate.body.refusals import NOTHING_MOVES

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from palpate.body.imaged import ImagedStates, LaterImage
 from palpate.case.case import Case
-from palpate.case.case_body import MeshBody
-from palpate.case.case_tissue import REMAINING, CaseTissue
 from palpate.case.schema import nearest, shown
+from palpate.case.sources import MeshBody
+from palpate.case.tissue import REMAINING, CaseTissue
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.findings import Finding
 from palpate.images.label_image import VoxelGrid

@@ -13,8 +13,8 @@ from palpate.body.meshed_body import mesh_states, with_prescribed
 from palpate.body.provenance import file_digest, input_digests
 from palpate.body.refusals import refuse_large, refuse_still, refuse_what_cannot_be_estimated, require_samples
 from palpate.case.case import Case
-from palpate.case.case_body import ImagePair
 from palpate.case.schema import nearest, shown
+from palpate.case.sources import ImagePair
 from palpate.errors import ConfigurationError
 from palpate.images.body_in_ct import outside_body
 from palpate.images.label_table import read_label_table

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from palpate.case.case import DriverMotion as DriverMotion
     from palpate.case.case import Mechanics as Mechanics
     from palpate.case.case import MeshSettings as MeshSettings
-    from palpate.case.case_body import Phantom as Phantom
-    from palpate.case.case_file import read_case as read_case
+    from palpate.case.file import read_case as read_case
+    from palpate.case.sources import Phantom as Phantom
 
 __getattr__, __dir__ = front_door(__name__)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from palpate.case.case_body import (
+from palpate.case.data import CaseData, CaseLoad
+from palpate.case.schema import rule, shown
+from palpate.case.sources import (
     AUTO,
     LAW_NAMES,
     SEED,
@@ -17,9 +19,7 @@ from palpate.case.case_body import (
     Pair,
     Phantom,
 )
-from palpate.case.case_data import CaseData, CaseLoad
-from palpate.case.case_tissue import KILOPASCALS, REMAINING, CaseTissue, refuse_name
-from palpate.case.schema import rule, shown
+from palpate.case.tissue import KILOPASCALS, REMAINING, CaseTissue, refuse_name
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.laws.contract import Law

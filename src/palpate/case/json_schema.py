@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from palpate.case.case import Case
-from palpate.case.case_tissue import CaseTissue
 from palpate.case.schema import MOST_LETTERS, Rule
+from palpate.case.tissue import CaseTissue
 from palpate.images.named_labels import MAX_LABEL, MAX_NAME
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"

@@ -106,7 +106,7 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
 
     `written` gets the names of the files that take their places.
     """
-    from palpate.case.case_file import read_case
+    from palpate.case.file import read_case
     from palpate.images.input_file import like
     from palpate.steps.display import PATIENCE_S, progress_on_stderr
 

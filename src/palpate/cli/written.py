@@ -23,7 +23,7 @@ TARGETS = (RESULT, *RESULT_FILES, "case.toml")
 
 def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Estimate a case, or images for which a case is written first."""
-    from palpate.case.case_file import read_case
+    from palpate.case.file import read_case
     from palpate.steps import commands
     from palpate.steps.previewing import PREVIEW, write_page
     from palpate.steps.saving import save_failure
@@ -56,7 +56,7 @@ def estimate(arguments: argparse.Namespace, case: Case | None, outputs: OutputFo
 
 def demo(_: argparse.Namespace, case: None, outputs: OutputFolder, progress: Progress) -> Outcome:
     """Estimate the example that is installed with Palpate: a pelvis with a simulated later state."""
-    from palpate.case.case_file import read_case
+    from palpate.case.file import read_case
     from palpate.demo import DATA as IMAGES
     from palpate.demo import run_demo
     from palpate.study.earlier import refuse_other_case

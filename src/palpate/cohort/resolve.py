@@ -12,7 +12,7 @@ from typing import Any
 
 from palpate.body.provenance import file_digest, software_versions
 from palpate.case.case import Case
-from palpate.case.case_file import case_tables, read_case
+from palpate.case.file import case_tables, read_case
 from palpate.cohort.task import Row
 from palpate.errors import ConfigurationError, InputDataError, PalpateError
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import IO
 
-from palpate.case.case_file import case_text
+from palpate.case.file import case_text
 from palpate.cohort.plan import read_mark, write_mark
 from palpate.cohort.resolve import case_of, row_key
 from palpate.cohort.task import CLASS_OF_EXIT_CODE, Limits, Outcome, Task

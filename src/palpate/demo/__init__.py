@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.images import Role, Tissue
 from palpate.progress import Line, Progress
 from palpate.statement.result import CaseResult

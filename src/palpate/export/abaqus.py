@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.body.case_loads import loads_on
+from palpate.body.loads import loads_on
 from palpate.export.conditions import prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel
 from palpate.export.groups import (

@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.body.case_loads import loads_on
+from palpate.body.loads import loads_on
 from palpate.errors import ConfigurationError
 from palpate.export.conditions import Prescribed, prescribed
 from palpate.export.fitted_model import FittedBody, FittedModel

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.case.case_data import CaseLoad
+from palpate.case.data import CaseLoad
 from palpate.errors import ConfigurationError, EstimationError, InputDataError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Tissue
@@ -17,7 +17,7 @@ from palpate.mechanics.laws.contract import Law
 from palpate.mechanics.laws.registry import law_from
 from palpate.mesh.space import LagrangeSpace, lagrange_space
 from palpate.mesh.tet_mesh import TetMesh
-from palpate.statement.estimated import ModulusEstimate
+from palpate.statement.estimation import ModulusEstimate
 from palpate.statement.result import CaseResult
 from palpate.statement.samples import ModulusSamples
 

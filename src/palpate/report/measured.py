@@ -20,7 +20,7 @@ from palpate.report.report_data import (
     SliceBox,
 )
 from palpate.report.surfaces import carried_outline
-from palpate.statement.estimated import PointFit
+from palpate.statement.estimation import PointFit
 from palpate.statement.result import CaseResult
 
 OF_BOX = 0.1  # of the slices' longest edge: how long an arrow is drawn that is longer than all but some

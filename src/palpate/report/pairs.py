@@ -9,7 +9,7 @@ import igl
 import numpy as np
 
 from palpate.body.provenance import pair_names
-from palpate.case.case_body import Images
+from palpate.case.sources import Images
 from palpate.images.alignment import within_border
 from palpate.images.tissue import Role
 from palpate.report.report_data import BoneDistance, InputImage, TriangleSurface

@@ -23,7 +23,7 @@ from palpate.report.report_data import MapSlice, ReportData, TissueMap
 from palpate.report.scales import Scale, shown_stiffness
 from palpate.report.section import VIEWS, Plane
 from palpate.report.svg import INK, draw_svg
-from palpate.statement.map_words import RESOLVED, map_words
+from palpate.statement.map_summary import RESOLVED, map_summary
 from palpate.statement.result import CaseResult
 from palpate.statement.stiffness_scale import StiffnessScale
 
@@ -53,7 +53,7 @@ def tissue_maps(result: CaseResult) -> tuple[TissueMap, ...]:
             slices.append(MapSlice(*(field.reshape(plane.points.shape[:2]).astype(np.float32) for field in fields)))
         cut = low, high, middle, tuple(slices)
         elements = of.elements.astype(np.int32), shown.astype(np.float32)
-        found.append(TissueMap(tissue, map_words(of), mean, *cut, *elements))
+        found.append(TissueMap(tissue, map_summary(of), mean, *cut, *elements))
     return tuple(found)
 
 

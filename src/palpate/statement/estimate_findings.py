@@ -13,8 +13,8 @@ from palpate.images.checks import later_names
 from palpate.inversion import Inversion
 from palpate.mechanics.element import deformation_determinants
 from palpate.observation.contract import OfInstrument
-from palpate.statement.estimated import ModulusEstimate
-from palpate.statement.together import ImagePairs
+from palpate.statement.estimation import ModulusEstimate
+from palpate.statement.image_pairs import ImagePairs
 from palpate.statement.variations import NAMES, Variation, ratio_change
 from palpate.uncertainty import FittedState
 

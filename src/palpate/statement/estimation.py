@@ -1,260 +1,205 @@
-"""What is stated of an inversion: the intervals of its moduli, every start, the fit of everything observed."""
+"""What is found by one estimate, as values: moduli with interval and verdict, every start, the fit of what was seen."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.body.poisson_ratios import NOT_IDENTIFIED, ratios_of
-from palpate.images.checks import later_names
-from palpate.inversion import (
-    EarlierImages,
-    Inversion,
-    InversionSettings,
-    Iterate,
-    Linearisation,
-    StartRun,
-    earlier_images,
-)
-from palpate.mesh.voxelise import voxelise
-from palpate.observation.contract import Fit, Imaged, OfInstrument, OfPoints, seen_by
-from palpate.progress import Progress, silent
-from palpate.statement.discrepancy import FoundDiscrepancy, discrepancy_findings, discrepancy_of, fitted_materials
-from palpate.statement.estimate_findings import (
-    data_findings,
-    fold_findings,
-    inversion_findings,
-    pair_findings,
-    variation_findings,
-)
-from palpate.statement.estimated import Estimation, ForceFit, Iteration, PointFit, Start, StatedExplanation, TissueFit
-from palpate.statement.map_words import map_findings
-from palpate.statement.misfit import beside_misfits, misfits_of
-from palpate.statement.samples import draw_moduli
-from palpate.statement.stated_posterior import StatedPosterior, as_stated
-from palpate.statement.together import combinations_of, image_pairs_of, regions_of
+from palpate.body.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate
+from palpate.findings import Finding
+from palpate.inversion import EarlierImages
+from palpate.observation.contract import Fit, PointMotions
+from palpate.statement.discrepancy import FittedMaterial, FoundDiscrepancy
+from palpate.statement.image_pairs import ImagePairs
+from palpate.statement.joint import ModulusRegion
+from palpate.statement.samples import ModulusSamples
 from palpate.statement.variations import Variation
-from palpate.statement.verdicts import IDENTIFIED, estimates_of, intervals_of
-from palpate.uncertainty import (
-    GRID_DRAWS,
-    Covariance,
-    FittedState,
-    correlated_factor,
-    covariance_of,
-    grid_errors,
-    information,
-    information_shares,
-    stiffness_maps,
-)
-
-LEAST_TOLD = 0.01  # probability of an explanation that the result names
+from palpate.uncertainty import Combination, Covariance, Information, Interval, StiffnessMap
 
 
 @dataclass(frozen=True, slots=True)
-class Observed:
-    """The fitted later states, and each image's tissue index (nx, ny, nz), None of a state that is not imaged."""
+class Iteration:
+    """One step of one start: misfit (mm^2), moduli (kPa, or ratios), and the decrement still promised."""
 
-    states: tuple[FittedState, ...]
-    images: tuple[NDArray[np.int16] | None, ...]
+    objective_mm2: float
+    moduli: Mapping[str, float]
+    decrement: float
 
 
-def conclude(
-    inversion: Inversion,
-    settings: InversionSettings,
-    observed: Observed,
-    *,
-    truth: Mapping[str, float],
-    seed: int,
-    samples: int = 0,
-    vary: Callable[[StatedPosterior], tuple[Variation, ...]] = lambda _: (),
-    progress: Progress = silent,
-) -> Estimation:
-    """State the result of an inversion; `truth`: true moduli (kPa) by tissue where they are known.
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What one start did alone: moduli (kPa, or ratios) it began and ended with, its steps and how they ended.
 
-    samples: draws of the moduli's posterior, where the estimate converged; 0: none; vary: what would change it then.
-    The covariance is the sandwich under the residuals' noise model plus the scatter over grid positions.
+    minimum: number, from 0, of the distinct minimum that it leads to; None where that was not followed, others being
+    lower.
     """
-    objective, minimum = inversion.objective, inversion.minimum
-    rng = np.random.default_rng(seed)
-    progress(f"intervals: correlation of the residuals, and the model as {GRID_DRAWS} random voxel grids show it")
-    errors = grid_errors(objective, minimum.evaluation, observed.states, rng=rng)
-    sought = [objective.parameters.columns(i) for i, block in enumerate(objective.parameters.blocks) if block.sought]
-    every = covariance_of(objective, minimum.evaluation, errors, further=sought)
-    own = every.of_first(objective.n_parameters)
-    progress("intervals: the models made exact where profiles end")
-    posterior = as_stated(inversion, own, settings.bounds)
-    covariance = posterior.mixture.covariance
-    progress("intervals: profiles, and the fit of every surface before and after")
-    pairs = image_pairs_of(inversion, settings.bounds, errors, posterior.frozen)
-    known = intervals_of(inversion, settings, posterior)
-    fits, forces, points = _seen(inversion, observed)
-    misfits = misfits_of(minimum.evaluation.linearisations, points, observed.states[0].space.mesh.tissues)
-    told = misfits if minimum.converged else ()
-    estimates = beside_misfits(estimates_of(inversion, known, covariance, truth=truth), told)
-    stating = {e.tissue for e in estimates if e.verdict != NOT_IDENTIFIED}
-    pairs = pairs and pairs.with_intervals_of(stating)
-    regions = regions_of(inversion, posterior, settings.bounds, tissues=stating)
-    drawn = None
-    if samples and minimum.converged:
-        progress(f"intervals: {samples} samples of the posterior")
-        marginals, ends = [of.marginal for of in known], [of.interval for of in known]
-        drawn = draw_moduli(objective.parameters, posterior.mixture, marginals, ends, draws=samples, rng=rng)
-    found_discrepancy = discrepancy_of(inversion, observed.states) if minimum.converged else FoundDiscrepancy()
-    maps = stiffness_maps(inversion, np.diag(covariance.total)) if minimum.converged else ()
-    shares = dict[str, Mapping[str, float]]()
-    if minimum.converged:  # of each kind of data in what is known of a tissue's modulus
-        of_tissues = information_shares(minimum.evaluation, objective.n_parameters)
-        shares = dict(zip(objective.parameters.tissues, of_tissues, strict=False))
-    variations = vary(posterior) if minimum.converged else ()
-    names = later_names(len(observed.images))
-    if all(image is None for image in observed.images):  # the body is given as a mesh
-        names = [f"state {number}" for number in range(1, len(observed.images) + 1)]
-    findings = (
-        *inversion_findings(inversion, covariance.total),
-        *pair_findings(pairs, names),
-        *fold_findings(observed.states, names),
-        *data_findings(inversion),
-        *(misfit.finding for misfit in misfits),
-        *discrepancy_findings(found_discrepancy),
-        *map_findings(maps),
-        *variation_findings(variations, estimates),
-    )
-    return Estimation(
-        status="converged" if minimum.converged else "not converged",
-        reason=_reason(inversion),
-        estimates=estimates,
-        poisson_ratios=beside_misfits(ratios_of(inversion, every), told),
-        covariance=covariance,
-        with_ratios=every if sought else None,
-        starts=tuple(_start(inversion, start) for start in inversion.starts),
-        fits=fits,
-        forces=forces,
-        points=points,
-        displacements=tuple(state.displacement for state in observed.states),
-        counts=asdict(inversion.counts) | {"evaluations": inversion.evaluations},
-        outer_loop=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
-        remarks=findings,
-        observations={observation.kind: observation.description for observation in objective.observations},
-        information=information(covariance.total),
-        information_shares=shares,
-        discrepancy=found_discrepancy,
-        combinations=combinations_of(inversion, posterior, settings.bounds, within=IDENTIFIED),
-        regions=regions,
-        image_pairs=pairs,
-        samples=drawn,
-        maps=maps,
-        explanations=_explanations(inversion) if minimum.converged else (),
-        materials=fitted_materials(inversion),
-        variations=variations,
-        images=_told(inversion, settings, own) if known and all(None not in of.interval for of in known) else None,
-    )
+
+    start: Mapping[str, float]
+    end: Mapping[str, float]
+    objective_mm2: float
+    status: str
+    reason: str
+    minimum: int | None
+    history: tuple[Iteration, ...]
+
+    @property
+    def iterations(self) -> int:
+        """Number of accepted points."""
+        return len(self.history)
 
 
-def _told(inversion: Inversion, settings: InversionSettings, own: Covariance) -> EarlierImages | None:
-    """What the images tell, for others that are added; None where that is no law.
+@dataclass(frozen=True, slots=True)
+class ModulusEstimate:
+    """Young's modulus of one tissue, in `unit` (kPa, or a ratio to `relative_to`), with its 95 % interval.
 
-    With the errors that the posterior leaves out, but the mesh's, which added images share. It is not asked of a
-    posterior with an open end, which is far from normal: added images would be held where nothing tells a modulus.
+    interval95: with all discrepancies of the model as unknowns, layers too; the verdict follows from it;
+    interval95_given_model: what would be left if the model held. None: no interval is stated, as of every modulus that
+    is not identified; `value` is None in ratio mode and when nothing converged. variance_shares: of each cause in the
+    variance of ln E; profile: values (kPa, or ratios) with their signed root deviances.
     """
-    parameters, n_images = inversion.objective.parameters, len(inversion.objective.states)
-    wider, beside = correlated_factor(own), own.of_held + own.grid
-    seen = np.isfinite(wider) & np.isfinite(np.diag(beside))  # a modulus that moves nothing has no errors
-    errors = {"wider": np.where(seen, wider, 1.0), "beside": np.where(np.outer(seen, seen), beside, 0.0)}
-    try:
-        return earlier_images(inversion.mixture, parameters, settings.bounds, n_images=n_images, **errors)
-    except np.linalg.LinAlgError:
-        return None
+
+    tissue: str
+    unit: str
+    value: float | None
+    interval95: Interval | None
+    interval_kind: str
+    relative_to: str
+    ratio: float | None
+    ratio_interval95: Interval | None
+    verdict: str
+    why: str
+    truth: float | None = None
+    parameter: str = "youngs_modulus"
+    variance_shares: Mapping[str, float] | None = None
+    profile: tuple[tuple[float, float], ...] = ()
+    interval95_given_model: Interval | None = None
 
 
-def _reason(inversion: Inversion) -> str:
-    """How the estimate ended, and what became of the starts.
+@dataclass(frozen=True, slots=True)
+class TissueFit:
+    """Fit of one observation in one later image, before and after the estimation; `tissue`: its name."""
 
-    These are followed alone on the cheapest model: all of them may end, and the estimate that goes on from there not.
+    tissue: str
+    start: Fit
+    end: Fit
+    observed_share: float
+
+
+@dataclass(frozen=True, slots=True)
+class ForceFit:
+    """A measured and the fitted force of a later state (its number, from 0), N, with its standard deviation."""
+
+    name: str
+    state: int
+    measured_n: float
+    fitted_n: float
+    sd_n: float
+
+
+@dataclass(frozen=True, slots=True)
+class PointFit:
+    """Points whose motion was measured in a later state (its number, from 0), beside the fitted model's.
+
+    misfit: root mean square of the residuals that count, over the standard deviation stated, dimensionless.
     """
-    ended = [start.candidate for start in inversion.starts if start.minimum.converged]
-    distinct = len({candidate for candidate in ended if candidate is not None})
-    minima = f"{distinct} distinct {'minimum' if distinct == 1 else 'minima'}"
-    starts = f"{inversion.minimum.outcome.value}; {len(ended)} of {len(inversion.starts)} starts"
-    if not inversion.minimum.converged:
-        return f"{starts} led to {minima} of the starting model, but the estimate from there did not converge"
-    return f"{starts} converged, to {minima}"
+
+    name: str
+    state: int
+    motions: PointMotions
+    misfit: float
 
 
-def _start(inversion: Inversion, start: StartRun) -> Start:
-    minimum = start.minimum
-    return Start(
-        start=_moduli(inversion, start.theta),
-        end=_moduli(inversion, minimum.unknowns[: len(start.theta)]),
-        objective_mm2=minimum.evaluation.misfit_mm2,
-        status="converged" if minimum.converged else "not converged",
-        reason=minimum.outcome.value,
-        minimum=start.candidate,
-        history=tuple(_iteration(inversion, iterate) for iterate in minimum.history),
-    )
+@dataclass(frozen=True, slots=True)
+class StatedExplanation:
+    """One of the explanations of all later images: its probability, and the moduli (kPa, or ratios) under it.
+
+    scenario: of all tissues and of the frame, in words; images: which surfaces each later one draws otherwise.
+    """
+
+    scenario: tuple[str, ...]
+    images: tuple[tuple[str, ...], ...]
+    probability: float
+    moduli: Mapping[str, float]
 
 
-def _iteration(inversion: Inversion, iterate: Iterate) -> Iteration:
-    return Iteration(iterate.misfit_mm2, _moduli(inversion, iterate.theta), iterate.decrement)
+@dataclass(frozen=True, slots=True)
+class Estimation:
+    """Result of one inversion.
 
+    estimates: of the moduli; poisson_ratios: of those that were sought beside them; covariance: of the log-moduli;
+    with_ratios: of these and then of the ratios under the likeliest explanation, None where none is sought; fits:
+    the tissues of each later image; displacements: (n_points, 3) mm of each later image;
+    outer_loop: the steps from the best start's minimum to the estimate, which all starts of that minimum share;
+    counts: of all starts and minima together; observations: what was compared, in words, by its kind; information: the
+    directions of the log-moduli by how well they are known; information_shares: by tissue, of each kind of data, and of
+    what was believed before; discrepancy: what the images say of frame, drawing and material; combinations: what is
+    known where single moduli are not; regions: joint ones of two moduli; forces, points: measured and fitted;
+    image_pairs: what each of several later images says alone; samples: of the moduli's posterior,
+    where the case asks for them and the estimate converged; variations: what would change the answer; maps: of tissues
+    whose modulus is a field; materials: of the elements, one for each later state;
+    images: what they tell, for others that are added;
+    explanations: the likelier ones of those of which the posterior is a mixture.
+    """
 
-def _explanations(inversion: Inversion) -> tuple[StatedExplanation, ...]:
-    """Those with a probability of `LEAST_TOLD` at least, the likeliest first."""
-    return tuple(
-        StatedExplanation(of.scenario, of.images, of.weight, _moduli(inversion, of.theta))
-        for of in inversion.mixture.explanations
-        if of.weight >= LEAST_TOLD
-    )
+    status: str
+    reason: str
+    estimates: tuple[ModulusEstimate, ...]
+    covariance: Covariance
+    starts: tuple[Start, ...]
+    fits: tuple[tuple[TissueFit, ...], ...]
+    displacements: tuple[NDArray[np.float64], ...]
+    counts: Mapping[str, int]
+    outer_loop: tuple[Iteration, ...] = ()
+    remarks: tuple[Finding, ...] = ()
+    observations: Mapping[str, str] = field(default_factory=dict)
+    information: Information | None = None
+    information_shares: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    combinations: tuple[Combination, ...] = ()
+    discrepancy: FoundDiscrepancy = field(default_factory=FoundDiscrepancy)
+    regions: tuple[ModulusRegion, ...] = ()
+    image_pairs: ImagePairs | None = None
+    samples: ModulusSamples | None = None
+    poisson_ratios: tuple[PoissonRatioEstimate, ...] = ()
+    with_ratios: Covariance | None = None
+    forces: tuple[ForceFit, ...] = ()
+    points: tuple[PointFit, ...] = ()
+    variations: tuple[Variation, ...] = ()
+    maps: tuple[StiffnessMap, ...] = ()
+    materials: tuple[FittedMaterial, ...] = ()
+    images: EarlierImages | None = None
+    explanations: tuple[StatedExplanation, ...] = ()
 
-
-def _moduli(inversion: Inversion, theta: NDArray[np.float64]) -> dict[str, float]:
-    """Moduli in kPa, or ratios when no modulus is known."""
-    mapping = inversion.objective.parameters
-    moduli = mapping.scale_kpa * np.exp(theta[: len(mapping.tissues)])
-    return dict(zip(mapping.tissues, moduli.tolist(), strict=True))
-
-
-def _fit(line: Linearisation, modelled: NDArray[np.int16] | None, image: NDArray[np.int16] | None) -> Fit:
-    """The fit of one observation; of a tissue that images show with Dice's 2 |A and B| / (|A| + |B|)."""
-    found, seen = line.observation.fit(line.residuals), line.observation
-    if not isinstance(seen, Imaged) or modelled is None or image is None:
+    @property
+    def correlation(self) -> NDArray[np.float64]:
+        """Correlation (n, n) of the log-moduli, then of the Poisson's ratios that are sought, dimensionless."""
+        own = self.covariance.correlation
+        found = own if self.with_ratios is None else self.with_ratios.correlation
+        found[: len(own), : len(own)] = own
         return found
-    both = modelled == seen.tissue, image == seen.tissue
-    overlap = 2.0 * int((both[0] & both[1]).sum()) / max(sum(int(of.sum()) for of in both), 1)
-    return replace(found, dice=overlap)
+
+    @property
+    def found_ratios(self) -> dict[str, float]:
+        """The Poisson's ratios that were sought, by their tissue, as far as there are any."""
+        return {of.tissue: of.value for of in self.poisson_ratios if of.value is not None}
 
 
-def _seen(
-    inversion: Inversion, observed: Observed
-) -> tuple[tuple[tuple[TissueFit, ...], ...], tuple[ForceFit, ...], tuple[PointFit, ...]]:
-    """All that was observed beside what the fitted model says: in each later image, by instruments, at points."""
-    fits, forces, points = list[tuple[TissueFit, ...]](), list[ForceFit](), list[PointFit]()
-    for line in inversion.minimum.evaluation.linearisations:
-        seen, name = line.observation, line.observation.name
-        if isinstance(seen, OfInstrument):
-            fitted = seen.measured + float(line.residuals.values[0])
-            forces.append(ForceFit(name, line.state, seen.measured, fitted, line.observation.noise_model.sd))
-        elif isinstance(seen, OfPoints):
-            motions = seen.point_motions(seen_by(line.observation, observed.states[line.state].displacement.ravel()))
-            stated = line.observation.first_noise((line.observation,)).sd
-            misfit = float(np.sqrt(np.mean(line.residuals.values**2))) / stated
-            points.append(PointFit(name, line.state, motions, misfit))
-    for s, (state, image) in enumerate(zip(observed.states, observed.images, strict=True)):
-        ways = (np.zeros_like(state.displacement), state.displacement)
-        modelled = [None if image is None else voxelise(state.space, u, state.after, crossing=True) for u in ways]
-        lines = zip(inversion.rest.linearisations, inversion.minimum.evaluation.linearisations, strict=True)
-        of_state = [pair for pair in lines if pair[0].state == s and pair[0].observation.unit == "mm"]
-        fits.append(
-            tuple(
-                TissueFit(
-                    end.observation.name,
-                    _fit(start, modelled[0], image),
-                    _fit(end, modelled[1], image),
-                    end.observation.observed_share,
-                )
-                for start, end in of_state
-            )
-        )
-    return tuple(fits), tuple(forces), tuple(points)
+def no_estimate(
+    tissue: str, *, absolute: bool, relative_to: str, why: str, truth: float | None = None
+) -> ModulusEstimate:
+    """The entry of a tissue when nothing converged: no value that could be taken for a result."""
+    return ModulusEstimate(
+        tissue=tissue,
+        unit="kPa" if absolute else "ratio",
+        value=None,
+        interval95=None,
+        interval_kind="linearised",
+        relative_to=relative_to,
+        ratio=None,
+        ratio_interval95=None,
+        verdict=NOT_IDENTIFIED,
+        why=why,
+        truth=truth,
+    )

@@ -15,7 +15,7 @@ from palpate.findings import Finding
 from palpate.images.tissue import Tissue
 from palpate.inversion import Linearisation
 from palpate.observation.contract import Imaged, OfInstrument, OfPoints, PointMotions
-from palpate.statement.estimated import ModulusEstimate, PointFit
+from palpate.statement.estimation import ModulusEstimate, PointFit
 
 T = TypeVar("T", ModulusEstimate, PoissonRatioEstimate)
 

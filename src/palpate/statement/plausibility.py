@@ -14,7 +14,7 @@ from palpate.case.case import Case
 from palpate.case.tissue_names import found_word
 from palpate.findings import Finding
 from palpate.images.tissue import Role
-from palpate.statement.estimated import Estimation
+from palpate.statement.estimation import Estimation
 from palpate.uncertainty import NORMAL_95
 
 MARGIN = 3.0  # methods differ by ten to a hundred times: an estimate is doubtful only well outside what was published

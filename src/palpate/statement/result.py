@@ -16,8 +16,8 @@ from palpate.body.imaged import LaterImage
 from palpate.body.poisson_ratios import NOT_IDENTIFIED, PoissonRatioEstimate, no_ratio
 from palpate.body.provenance import image_names
 from palpate.case.case import Case
-from palpate.case.case_file import case_tables
-from palpate.case.case_tissue import CaseTissue
+from palpate.case.file import case_tables
+from palpate.case.tissue import CaseTissue
 from palpate.errors import NotConverged, PalpateError
 from palpate.findings import Finding, one_a_cause, warning_rows
 from palpate.images.label_image import LabelImage
@@ -27,9 +27,9 @@ from palpate.mesh.quality import MeshQuality
 from palpate.mesh.space import LagrangeSpace
 from palpate.progress import counted, grouped
 from palpate.statement.discrepancy import FoundDiscrepancy
-from palpate.statement.estimated import Estimation, ModulusEstimate, StatedExplanation, no_estimate
+from palpate.statement.estimation import Estimation, ModulusEstimate, StatedExplanation, no_estimate
 from palpate.statement.known_images import BuiltOn, KnownImages
-from palpate.statement.map_words import map_words
+from palpate.statement.map_summary import map_summary
 from palpate.uncertainty import StiffnessMap
 
 SCHEMA = "palpate.result/1"
@@ -442,7 +442,7 @@ def _map(of: StiffnessMap, names: Sequence[str]) -> dict[str, Any]:
         "after": names[of.state],
         "prior_sd": of.prior_sd,
         "resolved": of.resolved,
-        "words": map_words(of),
+        "words": map_summary(of),
         "region": region,
     }
 

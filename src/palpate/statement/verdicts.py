@@ -9,7 +9,7 @@ import numpy as np
 
 from palpate.body.poisson_ratios import NOT_IDENTIFIED, not_converged
 from palpate.inversion import Inversion, InversionSettings
-from palpate.statement.estimated import ModulusEstimate, no_estimate
+from palpate.statement.estimation import ModulusEstimate, no_estimate
 from palpate.statement.stated_posterior import StatedPosterior
 from palpate.uncertainty import (
     NORMAL_95,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.case.case import Case
-from palpate.case.case_file import case_tables, read_case
+from palpate.case.file import case_tables, read_case
 from palpate.errors import ConfigurationError, InputDataError, PalpateError
 from palpate.export.model_file import read_model
 from palpate.findings import Finding

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from palpate.body.provenance import software_versions
 from palpate.case.case import Case
-from palpate.case.case_file import toml_key
+from palpate.case.file import toml_key
 from palpate.errors import ConfigurationError, InputDataError, PalpateError, ResourceError
 from palpate.images.tissue import Role
 from palpate.progress import Line, Progress, details, silent

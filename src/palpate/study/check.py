@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from palpate.body.body import Body, cost_of_bodies, joint_problem, make_body
-from palpate.body.case_loads import load_warnings
 from palpate.body.contacts import every_finding
 from palpate.body.cost import (
     LESS_MEMORY,
@@ -22,11 +21,12 @@ from palpate.body.cost import (
     machine_memory_gb,
 )
 from palpate.body.imaged import ImagedStates, LaterImage, brought
+from palpate.body.loads import load_warnings
 from palpate.body.provenance import file_digest
 from palpate.body.read import measured, read_case_images, read_segmentation, read_states
 from palpate.body.refusals import refuse_lost, refuse_unmeshable, require_samples
 from palpate.case.case import Case
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.errors import PalpateError, ResourceError
 from palpate.findings import HELP, Finding, help_on, of_pair, one_a_cause, rank, with_places
 from palpate.images.checks import (

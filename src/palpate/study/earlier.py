@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.case.case import Case
-from palpate.case.case_file import case_tables, case_text, read_case, relative_path
+from palpate.case.file import case_tables, case_text, read_case, relative_path
 from palpate.case.schema import shortened
 from palpate.errors import ConfigurationError, InputDataError, PalpateError
 from palpate.findings import Finding

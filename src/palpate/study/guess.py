@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from palpate.case.case_tissue import is_tissue_name
+from palpate.case.tissue import is_tissue_name
 from palpate.case.tissue_names import found_word
 from palpate.errors import InputDataError
 from palpate.images.checks import OBSERVED

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.case.case_file import relative_path, toml_key, toml_text
-from palpate.case.case_tissue import REMAINING
+from palpate.case.file import relative_path, toml_key, toml_text
+from palpate.case.tissue import REMAINING
 from palpate.errors import ConfigurationError, InputDataError
 from palpate.images.checks import EMPTIED, later_names, refuse_unit
 from palpate.images.label_image import LabelImage

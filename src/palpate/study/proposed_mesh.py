@@ -13,8 +13,8 @@ from scipy.spatial import ConvexHull, QhullError
 from palpate.body.cost import MEMORY_FACTOR, cost_of_meshes, expected_size, machine_memory_gb, tets_by_edge_length
 from palpate.body.edge_length import edge_length_of
 from palpate.case.case import Case, Domain, MeshSettings
-from palpate.case.case_body import Images
-from palpate.case.case_tissue import REMAINING, CaseTissue
+from palpate.case.sources import Images
+from palpate.case.tissue import REMAINING, CaseTissue
 from palpate.images.body_in_ct import outside_body, shows_air
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.segmentation import segment

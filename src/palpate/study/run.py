@@ -10,15 +10,15 @@ from itertools import islice
 import numpy as np
 
 from palpate.body.body import Body, cost_of_bodies, joint_problem, make_body
-from palpate.body.case_loads import load_warnings
 from palpate.body.cost import ExpectedCost, expected_cost, refuse_lack
 from palpate.body.imaged import ImagedStates
+from palpate.body.loads import load_warnings
 from palpate.body.poisson_ratios import with_ratios
 from palpate.body.provenance import image_names, input_digests, software_versions
 from palpate.body.read import read_case_images, read_states
 from palpate.body.refusals import linear_strain_warnings
 from palpate.case.case import Case, Mechanics
-from palpate.case.case_body import LAW_NAMES
+from palpate.case.sources import LAW_NAMES
 from palpate.errors import EstimationError
 from palpate.findings import Finding, of_pair
 from palpate.images.tissue import Role
@@ -27,14 +27,14 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Line, Progress, counted, during, silent
-from palpate.statement.estimated import Estimation
-from palpate.statement.estimation import Observed, conclude
+from palpate.statement.conclude import Observed, conclude
+from palpate.statement.estimation import Estimation
 from palpate.statement.known_images import Added, KnownImages, why_together
 from palpate.statement.plausibility import estimate_warnings, unit_warnings
 from palpate.statement.result import CaseResult, MeshResult, MeshSummary, PairResult, Provenance
 from palpate.statement.stated_posterior import StatedPosterior
 from palpate.statement.variations import Variation, voxel_mm, what_would_change
-from palpate.study.inverted import inverted
+from palpate.study.case_inversion import invert_case
 from palpate.uncertainty import FittedState
 from palpate.unknowns import ParameterMap
 
@@ -104,7 +104,7 @@ def estimate_states(
     clock.append(time.perf_counter())
     later = "later image" if len(problem.states) == 1 else "later images"
     progress(Line(f"the moduli that explain the {later}, from {counted(len(settings.every_start), 'start')}", "search"))
-    inversion = inverted(bodies, problem, case, settings, progress=progress)
+    inversion = invert_case(bodies, problem, case, settings, progress=progress)
     best = inversion.objective.parameters.in_words(inversion.minimum.unknowns)
     progress(Line(f"best fit: {best}; how far can it be off?", "intervals"))
     stating = during("intervals", progress)

@@ -22,8 +22,8 @@ from palpate.body.edge_length import edge_length_of
 from palpate.body.provenance import software_versions
 from palpate.body.read import CaseImages, read_case_images
 from palpate.case.case import Case
-from palpate.case.case_body import LAW_NAMES
-from palpate.case.case_file import case_tables
+from palpate.case.file import case_tables
+from palpate.case.sources import LAW_NAMES
 from palpate.errors import (
     ConfigurationError,
     EstimationError,
@@ -38,10 +38,10 @@ from palpate.inversion import Inversion, InversionSettings, StopRule
 from palpate.mechanics.dilatation import choose_element
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Line, Progress, details, silent
-from palpate.statement.estimation import conclude
+from palpate.statement.conclude import conclude
 from palpate.statement.result import Provenance, closing, json_object
 from palpate.statement.variations import Variation, fast_variations, voxel_mm
-from palpate.study.inverted import inverted
+from palpate.study.case_inversion import invert_case
 from palpate.study.outputs import OutputFolder, make_folder, read_json, write_json
 from palpate.study.run import inversion_settings, observed_of
 
@@ -194,8 +194,8 @@ def _inverted(
     if start is not None:
         inside = np.clip(start, settings.bounds.lower, settings.bounds.upper)
         settings = replace(settings, starts=(inside,), further=())
-        return inverted(bodies, problem, case, settings, progress=progress, rule=VARIED), settings
-    return inverted(bodies, problem, case, settings, progress=progress), settings
+        return invert_case(bodies, problem, case, settings, progress=progress, rule=VARIED), settings
+    return invert_case(bodies, problem, case, settings, progress=progress), settings
 
 
 def _estimated(case: Case, bodies: Bodies, progress: Progress) -> dict[str, Any]:

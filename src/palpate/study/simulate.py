@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.body.body import Body, inverse_problem, make_body, strained_body
-from palpate.body.case_loads import case_loads
 from palpate.body.driver_fit import fit_driver
+from palpate.body.loads import case_loads
 from palpate.body.provenance import input_digests, software_versions
 from palpate.body.read import phantom_scene, read_states
 from palpate.case.case import Case, Mechanics

@@ -15,7 +15,7 @@ from pydicom.dataset import Dataset
 
 from dicom_files import TILTED, axes_of, ct_slices, save_contours, save_segmentation, save_series, traced
 from palpate.body.read import read_segmentation
-from palpate.case.case_file import read_case
+from palpate.case.file import read_case
 from palpate.errors import InputDataError, ResourceError
 from palpate.images import readers
 from palpate.images.label_image import LabelImage, VoxelGrid

@@ -189,7 +189,7 @@ class _Case:
         """What exact surfaces of `truth` say of every sphere."""
         model = _pulled_by(self.bench.coarse, self.stress_kpa)
         seen = exact_surfaces(model.space, truth.space, self.displacement(truth))
-        inversion, settings = self.inverted(model, seen, progress)
+        inversion, settings = self.invert_case(model, seen, progress)
         return entries_from_surfaces(inversion, settings, self.truth)
 
     def from_voxels(self, progress: Progress) -> dict[str, Entry]:
@@ -203,10 +203,10 @@ class _Case:
         body = make_body(states, case, progress=progress)
         model = _pulled_by(_model(body.space), self.stress_kpa)
         surfaces = tuple(observed_surface(body.space, number) for number in range(len(BODIES)))
-        inversion, settings = self.inverted(model, surface_distances(body.imaged(), surfaces)[0], progress)
+        inversion, settings = self.invert_case(model, surface_distances(body.imaged(), surfaces)[0], progress)
         return entries_from_voxels(inversion, settings, body, self.truth, seed=self.seed)
 
-    def inverted(
+    def invert_case(
         self, model: LinearModel, observations: tuple[Observation, ...], progress: Progress
     ) -> tuple[Inversion, InversionSettings]:
         """The inversion of all spheres' surfaces from half of their moduli, and its settings."""

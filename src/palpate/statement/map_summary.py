@@ -10,7 +10,7 @@ from palpate.uncertainty import CONTRAST, StiffnessMap
 RESOLVED = 0.5  # share of the prior's variance that data must remove for a map to be theirs
 
 
-def map_words(of: StiffnessMap) -> str:
+def map_summary(of: StiffnessMap) -> str:
     """One sentence, or two, on a map."""
     region = of.region
     if region is None:

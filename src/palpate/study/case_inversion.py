@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.body.body import Body, body_with_ratios, joint_problem, strained_body
-from palpate.body.case_loads import case_loads
+from palpate.body.loads import case_loads
 from palpate.body.poisson_ratios import sought_ratios
 from palpate.case.case import Case
 from palpate.errors import NotConverged
@@ -22,7 +22,7 @@ PASSES = 10
 SETTLED = 1e-3  # of ln E: change at which the passes stop; the next one would change less, by the reference's strain
 
 
-def inverted(
+def invert_case(
     bodies: Sequence[Body],
     problem: InverseProblem,
     case: Case,

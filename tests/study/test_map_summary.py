@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.statement.map_words import map_findings, map_words
+from palpate.statement.map_summary import map_findings, map_summary
 from palpate.uncertainty import DifferentRegion, StiffnessMap
 
 
@@ -15,7 +15,7 @@ def map_of(resolved, region=None):
 
 def test_a_part_is_told_with_its_volume_place_contrast_and_probability():
     region = DifferentRegion(np.arange(2), 1.44, np.array([1.2, -30.4, 8.0]), 0.4, (0.3, 0.55), 0.9931)
-    words = map_words(map_of(0.8, region))
+    words = map_summary(map_of(0.8, region))
     for told in (
         "'prostate'",
         "1.4 mL",
@@ -27,12 +27,12 @@ def test_a_part_is_told_with_its_volume_place_contrast_and_probability():
         "its core is",
     ):
         assert told in words
-    assert "stiffer" in map_words(map_of(0.8, DifferentRegion(np.arange(2), 1.0, np.zeros(3), 3.0, (2.0, 4.0), 0.97)))
+    assert "stiffer" in map_summary(map_of(0.8, DifferentRegion(np.arange(2), 1.0, np.zeros(3), 3.0, (2.0, 4.0), 0.97)))
 
 
 def test_no_part_is_another_thing_than_not_being_able_to_tell():
-    assert "No part" in map_words(map_of(0.8))
-    assert "cannot tell" in map_words(map_of(0.3))
+    assert "No part" in map_summary(map_of(0.8))
+    assert "cannot tell" in map_summary(map_of(0.3))
 
 
 def test_a_map_that_is_the_priors_is_warned_of():

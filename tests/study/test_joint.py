@@ -8,8 +8,9 @@ import pytest
 from palpate.inversion import fixed_correspondence, invert
 from palpate.observation.noise_model import NoiseModel
 from palpate.statement.estimate_findings import pair_findings
+from palpate.statement.image_pairs import ImagePairs, PairAlone, image_pairs_of
+from palpate.statement.joint import combinations_of, regions_of
 from palpate.statement.stated_posterior import StatedPosterior
-from palpate.statement.together import ImagePairs, PairAlone, combinations_of, image_pairs_of, regions_of
 from palpate.uncertainty import Covariance, StatedMixture, sandwich_covariance
 
 NOISE = NoiseModel(np.array([0.1**2]), np.array([3.0]))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.case.case import Case
-from palpate.case.case_data import CaseLoad
+from palpate.case.data import CaseLoad
 from palpate.errors import ConfigurationError
 from palpate.findings import Finding
 from palpate.images.tissue import Role

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from palpate.case.case import Case
-from palpate.case.case_tissue import POISSON_RATIO, CaseTissue
 from palpate.case.schema import Rule, read_table, shortened
+from palpate.case.tissue import POISSON_RATIO, CaseTissue
 from palpate.errors import ConfigurationError
 from palpate.images.input_file import read_input
 from palpate.images.named_labels import printable

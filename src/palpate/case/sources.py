@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from palpate.case.case_tissue import refuse_name
 from palpate.case.schema import rule
+from palpate.case.tissue import refuse_name
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
 from palpate.mechanics.laws.registry import LAWS
