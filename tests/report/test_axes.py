@@ -13,9 +13,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from palpate.cohort import charts as cohort_charts
-from palpate.report import charts, tornado
+from palpate.report import charts
 from palpate.report.collect import collect
-from palpate.report.svg import STYLE
+from palpate.report.svg import SIZE, STYLE
+from palpate.report.tornado import tornado
 from palpate.statement.image_pairs import ImagePairs, PairAlone
 from palpate.statement.joint import ModulusRegion
 from palpate.statement.variations import Variation
@@ -24,23 +25,14 @@ TURN = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
 EDGE = tuple((58.9 * math.exp(0.4 * math.cos(t)), 31.2 * math.exp(0.5 * math.sin(t))) for t in TURN.tolist())
 
 
-def drawn(monkeypatch, module, draw) -> Figure:
+def drawn(chart, *arguments) -> Figure:
     """The figure that a chart paints, before it becomes text."""
-    figures = []
-
-    def keep(paint, *, size, **_):
-        with mpl.rc_context(STYLE):
-            figure = Figure(figsize=size)
-            FigureCanvasAgg(figure)
-            paint(figure)
-            figure.canvas.draw()
-        figures.append(figure)
-        return ""
-
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "draw_svg", keep)
-        draw()
-    return figures[0]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=SIZE, layout="constrained")
+        FigureCanvasAgg(figure)
+        chart(figure, *arguments)
+        figure.canvas.draw()
+    return figure
 
 
 def data_in(case_result, unit):
@@ -61,15 +53,15 @@ def data_in(case_result, unit):
 
 
 CHARTS = {
-    "profile": lambda data: charts.profile_svg(data, 0, name="a"),
-    "region": lambda data: charts.region_svg(data, 0, name="a"),
-    "repeats": lambda data: charts.repeats_svg(data, 0, name="a"),
-    "modulus": lambda data: charts.modulus_svg(data, 0, name="a"),
-    "misfit": lambda data: charts.objective_svg(data, name="a"),
-    "waterfall": lambda data: charts.waterfall_svg(data, name="a"),
-    "angles": lambda data: charts.angle_svg(data.mesh.angles, name="a"),
-    "residuals": lambda data: charts.residual_svg(data, data.later[0].model[0], voxel_mm=1.0, name="a"),
-    "tornado": lambda data: tornado.tornado_svg(data.document, "prostate", name="a"),
+    "profile": lambda figure, data: charts.profile(figure, data, data.document["estimates"][0]),
+    "region": lambda figure, data: charts.region(figure, data, data.document["regions"][0]),
+    "repeats": lambda figure, data: charts.repeats(figure, data, data.document["estimates"][0]),
+    "modulus": lambda figure, data: charts.modulus(figure, data, data.document["estimates"][0]),
+    "misfit": lambda figure, data: charts.objective(figure, data.document),
+    "waterfall": lambda figure, data: charts.waterfall(figure, data.document),
+    "angles": lambda figure, data: charts.angles(figure, data.mesh.angles),
+    "residuals": lambda figure, data: charts.residuals(figure, data, data.later[0].model[0], 1.0),
+    "tornado": lambda figure, data: tornado(figure, data.document, "prostate"),
 }
 
 
@@ -98,10 +90,8 @@ def assert_readable(figure, *, categories=()):
 
 @pytest.mark.parametrize("unit", ["kPa", "ratio"])
 @pytest.mark.parametrize("chart", CHARTS)
-def test_every_axis_of_the_report_has_its_unit_and_marks_apart(case_result, monkeypatch, chart, unit):
-    data = data_in(case_result, unit)
-    module = tornado if chart == "tornado" else charts
-    figure = drawn(monkeypatch, module, lambda: CHARTS[chart](data))
+def test_every_axis_of_the_report_has_its_unit_and_marks_apart(case_result, chart, unit):
+    figure = drawn(CHARTS[chart], data_in(case_result, unit))
     assert_readable(figure, categories=("y",) if chart == "tornado" else ())
     labels = " ".join(axis.label.get_text() for axes in figure.axes for axis in (axes.xaxis, axes.yaxis))
     if chart in ("profile", "region", "repeats", "modulus"):
@@ -110,7 +100,7 @@ def test_every_axis_of_the_report_has_its_unit_and_marks_apart(case_result, monk
 
 
 @pytest.mark.parametrize("unit", ["kPa", "ratio"])
-def test_every_axis_of_a_cohort_has_its_unit_and_marks_apart(monkeypatch, unit):
+def test_every_axis_of_a_cohort_has_its_unit_and_marks_apart(unit):
     found = {"value": 20.0, "low95": 12.0, "high95": 33.0}
     summary = {"organ": {"median": 20.0, "combined": found, "censored": [[15.0, None]]}}
     values = {"kpa" if unit == "kPa" else "ratio": {"organ": [18.0, 20.0, 25.0]}}
@@ -118,12 +108,12 @@ def test_every_axis_of_a_cohort_has_its_unit_and_marks_apart(monkeypatch, unit):
         {"patient": f"P{i}", "stage": 1 + i % 3, "summary": summary, "kpa": {}, "ratio": {}} | values for i in range(6)
     ]
     line = {"factor_per_stage": 1.2, "at_mean_stage": 20.0, "mean_stage": 2.0}
-    for draw, categories in (
-        (lambda: cohort_charts.boxes_svg(patients, "organ", unit, name="a", pages={}), ("x",)),
-        (lambda: cohort_charts.scatter_svg(patients, "organ", unit, line, name="a", pages={}), ()),
-        (lambda: cohort_charts.forest_svg(patients, "organ", unit, name="a", pages={}), ("y",)),
+    for chart, more, categories in (
+        (cohort_charts.boxes, (), ("x",)),
+        (cohort_charts.scatter, (line,), ()),
+        (cohort_charts.forest, (), ("y",)),
     ):
-        figure = drawn(monkeypatch, cohort_charts, draw)
+        figure = drawn(chart, patients, "organ", unit, *more, {})
         assert_readable(figure, categories=categories)
         words = [axis.label.get_text() for axis in (figure.axes[0].xaxis, figure.axes[0].yaxis)]
         assert any(f"({unit})" in word for word in words)

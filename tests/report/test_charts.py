@@ -11,29 +11,16 @@ from matplotlib.figure import Figure
 from palpate.report import charts
 from palpate.report.collect import collect
 from palpate.report.rows import expected_share, scale_marks
-from palpate.report.svg import draw_svg, link_url
+from palpate.report.svg import SIZE, draw_svg, link_url
 
 
-@pytest.fixture
-def figure_of(monkeypatch):
+def figure_of(chart, *arguments):
     """What a chart draws, as matplotlib's own figure."""
-    drawn = []
-
-    def keep(draw, *, size, name, says):
-        del name, says
-        drawn.append(Figure(figsize=size))
-        FigureCanvasAgg(drawn[-1])
-        draw(drawn[-1])
-        drawn[-1].draw_without_rendering()
-        return ""
-
-    monkeypatch.setattr(charts, "draw_svg", keep)
-
-    def of(draw, *arguments, **options):
-        draw(*arguments, name="a", **options)
-        return drawn[-1]
-
-    return of
+    figure = Figure(figsize=SIZE, layout="constrained")
+    FigureCanvasAgg(figure)
+    chart(figure, *arguments)
+    figure.draw_without_rendering()
+    return figure
 
 
 def moduli_between(case_result, low, high):
@@ -47,22 +34,23 @@ def moduli_between(case_result, low, high):
 
 
 @pytest.mark.parametrize(("low", "high"), [(21.0, 24.0), (2.0, 90.0), (101.0, 103.0)])
-def test_an_axis_of_moduli_has_three_marks_or_more(case_result, figure_of, low, high):
-    (axes,) = figure_of(charts.modulus_svg, moduli_between(case_result, low, high), 0).axes
+def test_an_axis_of_moduli_has_three_marks_or_more(case_result, low, high):
+    data = moduli_between(case_result, low, high)
+    (axes,) = figure_of(charts.modulus, data, data.document["estimates"][0]).axes
     bottom, top = axes.get_ylim()
     assert sum(bottom <= mark <= top for mark in axes.get_yticks()) >= 3
 
 
-@pytest.mark.parametrize("draw", [charts.objective_svg, charts.waterfall_svg])
+@pytest.mark.parametrize("draw", [charts.objective, charts.waterfall])
 @pytest.mark.parametrize("misfit", [0.00123, 12.34])
-def test_the_label_of_the_misfit_lies_within_its_picture(case_result, figure_of, draw, misfit):
+def test_the_label_of_the_misfit_lies_within_its_picture(case_result, draw, misfit):
     data = collect(case_result)
     document = dict(data.document)
     document["starts"] = [
         dict(start) | {"objective_mm2": misfit, "history_mm2": [1.17 * misfit, misfit]} for start in document["starts"]
     ]
     document["outer_loop"] = {"history_mm2": [1.03 * misfit, 1.01 * misfit]}
-    figure = figure_of(draw, dataclasses.replace(data, document=document))
+    figure = figure_of(draw, document)
     label = figure.axes[0].yaxis.label.get_window_extent(figure.canvas.get_renderer())
     assert label.x0 >= 0.0
     assert label.y0 >= 0.0
@@ -80,9 +68,10 @@ def test_the_scale_of_the_bars_has_three_to_six_marks(low, high):
 def test_a_link_in_a_chart_has_its_address_and_its_words_escaped():
     def draw(figure):
         """One point."""
-        figure.add_axes((0, 0, 1, 1)).plot([1], [1], "o")[0].set_url(link_url(0))
+        figure.subplots().plot([1], [1], "o")[0].set_url(link_url(0))
+        return "a chart"
 
-    svg = draw_svg(draw, size=(1, 1), name="a", says="a chart", links=[('x/"<b>/report.html', "<i>")])
+    svg = draw_svg(draw, [('x/"<b>/report.html', "<i>")])
     assert '<a href="x/&#34;&lt;b&gt;/report.html" aria-label="&lt;i&gt;">' in svg
     assert 'role="group"' in svg
     assert "palpate-link" not in svg

@@ -9,6 +9,7 @@ import re
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from palpate.errors import ConfigurationError, EstimationError, InputDataError
@@ -137,7 +138,8 @@ def test_what_is_known_as_a_ratio_alone_is_drawn_as_ratios(data, tmp_path):
 
 def test_intervals_are_where_the_numbers_are(data):
     with mpl.rc_context(STYLE):
-        figure = moduli_sheet(data.document, {}, shown_unit(data.document, "ratio")).figure()
+        figure = Figure()
+        moduli_sheet(figure, data.document, {}, shown_unit(data.document, "ratio"))
     (axes,) = figure.axes
     lines = [line for line in axes.lines if line.get_gid() == "interval"]
     assert [list(line.get_xdata()) for line in lines] == [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+from functools import partial
 
 import matplotlib.image as mpimg
 import numpy as np
@@ -11,11 +12,13 @@ import pytest
 
 from palpate.report.collect import collect
 from palpate.report.cut_mesh import element_moduli
-from palpate.report.figures.maps import map_sheet
+from palpate.report.figures.every import map_sheet
+from palpate.report.figures.sheet import figure_files
 from palpate.report.page import render
 from palpate.report.report_data import ReportData
 from palpate.report.scales import modulus_scale
-from palpate.report.stiffness_maps import map_png, map_svg, tissue_maps
+from palpate.report.stiffness_maps import map_chart, map_png, tissue_maps
+from palpate.report.svg import draw_svg
 from palpate.uncertainty import DifferentRegion, StiffnessMap
 
 
@@ -59,7 +62,7 @@ def test_the_page_has_the_map_with_its_sentence_and_can_be_kept(mapped, tmp_path
     assert "Map of stiffness: prostate" in page
     assert "its core is 2.5 times as stiff as the rest of the tissue" in page.replace("\n", " ")
     assert "could not be drawn" not in page
-    svg = map_svg(data, data.maps[0], name="m")
+    svg = draw_svg(partial(map_chart, data=data, of=data.maps[0]))
     assert "<pattern" in svg  # the hatching
     assert svg.count("<image") >= 6
     picture = mpimg.imread(io.BytesIO(map_png(data, data.maps[0])))
@@ -71,7 +74,7 @@ def test_a_map_that_the_data_resolve_has_no_hatching(mapped):
     clear = dataclasses.replace(found, resolution=np.full_like(found.resolution, 0.9))
     result = dataclasses.replace(mapped, estimation=dataclasses.replace(mapped.estimation, maps=(clear,)))
     data = collect(result)
-    assert "<pattern" not in map_svg(data, data.maps[0], name="m")
+    assert "<pattern" not in draw_svg(partial(map_chart, data=data, of=data.maps[0]))
 
 
 def test_figures_show_the_map_in_the_unit_of_the_report(mapped):
@@ -87,6 +90,6 @@ def test_figures_show_the_map_in_the_unit_of_the_report(mapped):
     lost = dataclasses.replace(data, document=document)
     np.testing.assert_allclose(element_moduli(lost)[data.maps[0].elements], 0.1 * moduli, rtol=1e-6)
     for each, label in ((data, "Young's modulus (kPa)"), (lost, "E / E of surroundings (ratio)")):
-        sheet = map_sheet(each, 0)
-        assert label in sheet.caption
-        assert f">{label}</text>" in sheet.files(("svg",), dpi=60)["map-1.svg"].decode()
+        files, caption = figure_files("map", partial(map_sheet, data=each, of=each.maps[0]), ("svg",), dpi=60)
+        assert label in caption
+        assert f">{label}</text>" in files["map.svg"].decode()

@@ -9,9 +9,9 @@ from typing import Any
 
 from markupsafe import Markup
 
-from palpate.cohort.charts import boxes_svg, forest_svg, scatter_svg
+from palpate.cohort.charts import boxes, forest, scatter
 from palpate.cohort.records import Record
-from palpate.report.svg import template_of
+from palpate.report.svg import draw_svg, page_of
 
 LOGGER = logging.getLogger(__name__)
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
@@ -30,18 +30,19 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
             says = f"report of {record.row.id}, patient {record.row.patient}"
             pages.setdefault(record.row.patient, (record.page, says))
     patients, charts = document["patients"], dict[str, list[dict[str, Any]]]()
-    for place, (tissue, organ) in enumerate(document["organs"].items()):
+    links = {name: number for number, name in enumerate(pages)}
+    for tissue, organ in document["organs"].items():
+        of = {"patients": patients, "tissue": tissue, "unit": organ["unit"], "links": links}
         drawings = {
-            "Scans by stage, patients as points": partial(boxes_svg, patients, tissue, organ["unit"]),
-            "Patients against the stage": partial(scatter_svg, patients, tissue, organ["unit"], organ["regression"]),
-            "Patients": partial(forest_svg, patients, tissue, organ["unit"]),
+            "Scans by stage, patients as points": partial(boxes, **of),
+            "Patients against the stage": partial(scatter, line=organ["regression"], **of),
+            "Patients": partial(forest, **of),
         }
         charts[tissue] = []
-        for i, (title, draw) in enumerate(drawings.items()):
+        for title, chart in drawings.items():
             body, missing = None, ""
             try:
-                svg = draw(name=f"c{place}-{i}", pages=pages)
-                body = Markup(svg)  # noqa: S704 - drawn by us, names in it as paths
+                body = Markup(draw_svg(chart, list(pages.values())))  # noqa: S704 - drawn by us, names in it as paths
             except ValueError as error:
                 missing = str(error)
             except Exception as error:
@@ -49,7 +50,9 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
                 missing = f"it could not be drawn ({error})"
             charts[tissue].append({"title": title, "body": body, "missing": missing})
     shown = [record for record in records if record.state == "failed"] + [r for r in records if r.state != "failed"]
-    page: str = template_of("cohort.html", "palpate.cohort").render(
+    return page_of(
+        "cohort.html",
+        "palpate.cohort",
         records=shown[:MOST_ROWS],
         left_out=len(shown[MOST_ROWS:]),
         document=document,
@@ -58,4 +61,3 @@ def cohort_page(records: Sequence[Record], document: Mapping[str, Any], *, creat
         version=version,
         policy=POLICY,
     )
-    return page

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from palpate.report.figures.moduli import chosen_unit, draw_moduli
 from palpate.report.rows import NONE, estimate_rows, moduli_in, ratio_rows
-from palpate.report.svg import template_of
+from palpate.report.svg import page_of
 
 NOTEBOOK_DPI = 110
 STYLE = {"text.parse_math": False, "font.family": "DejaVu Sans"}  # a tissue called $x is a name, not a formula
@@ -41,7 +41,7 @@ def result_cards(document: Mapping[str, Any], colours: Mapping[str, str]) -> str
     document: result.json; colours: tissue -> #rrggbb.
     """
     rows, ratios = estimate_rows(document, colours), ratio_rows(document)
-    return str(template_of("cards.html").render(document=document, rows=rows, ratios=ratios))
+    return page_of("cards.html", document=document, rows=rows, ratios=ratios)
 
 
 class ShownFigure(Figure):

@@ -16,13 +16,13 @@ from palpate.images.checks import VOLUME_CHANGE
 from palpate.images.registration import length_text
 from palpate.images.tissue import Role, Tissue, tissue_colours
 from palpate.report.collect import MOST_LATER
-from palpate.report.page import page_scripts, picture_of, policy_of, widths_of
+from palpate.report.page import page_scripts, policy_of, slices_of, widths_of
 from palpate.report.payload import payload
 from palpate.report.preview_data import ROLE_COLOURS, PreviewImage, preview_data, preview_image
 from palpate.report.report_data import ReportData
 from palpate.report.rows import NONE, EstimateRow, estimate_rows, number, scale_marks
-from palpate.report.slices import alignment_svg, first_planes, slice_svg
-from palpate.report.svg import template_of
+from palpate.report.slices import alignment_chart, slice_chart
+from palpate.report.svg import page_of
 from palpate.report.units import shown_unit
 from palpate.report.volume import Grey, grey_of
 from palpate.study.check import Checked, Problem
@@ -52,52 +52,36 @@ def preview_page(checked: Checked, *, created: str, version: str, no_prediction:
     report, prediction = checked.report, checked.report.predicted
     images = shown.images if shown else ()
     scripts = page_scripts(SCRIPTS) if images else ()
-    cost, drawn, later = report.cost, len(images), sum(len(pair.after) for pair in checked.states)
+    drawn, later = len(images), sum(len(pair.after) for pair in checked.states)
     tissues = shown.states.before.tissues if shown else ()
     expected, marks, axis = _expected(prediction, shown.states if shown else None)
-    return str(
-        template_of("preview.html").render(
-            id=report.id,
-            patient=checked.case.patient if checked.case else report.id,
-            version=version,
-            created=created,
-            policy=policy_of(scripts),
-            scripts=scripts,
-            live=payload(shown.data, images) if shown and shown.data and images else None,
-            banner=_banner(report.problems, prediction),
-            problems=report.problems,
-            predicted=expected,
-            marks=marks,
-            axis=axis,
-            noise=prediction
-            and {
-                "sd": number(prediction.noise_sd_mm, digits=2),
-                "length": number(prediction.correlation_mm, digits=2),
-                "stated": prediction.stated,
-            },
-            no_prediction=no_prediction or "There is no prediction.",
-            cost=cost
-            and {
-                "time": cost.time_words,
-                "memory": cost.memory_words,
-                "solver": cost.solver,
-                "tets": cost.tets,
-                "unknowns": cost.unknowns,
-                "processors": cost.processors,
-            },
-            meshed=bool(checked.bodies),
-            tissues=tuple(_rows(tissues, shown.looks)) if shown else (),
-            names=shown.names if shown else (),
-            roles=[
-                (role, ROLE_COLOURS.get(role, "#888888"), ", ".join(t.name for t in tissues if str(t.role) == role))
-                for role in dict.fromkeys(str(tissue.role) for tissue in tissues)
-            ],
-            held=shown.frame.held if shown else (),
-            later=tuple(_later(shown, k, image) for k, image in enumerate(images)) if shown else (),
-            left_out=f"{drawn} of {later} later images are drawn, those of the first pair."
-            if 0 < drawn < later
-            else "",
-        )
+    return page_of(
+        "preview.html",
+        id=report.id,
+        patient=checked.case.patient if checked.case else report.id,
+        version=version,
+        created=created,
+        policy=policy_of(scripts),
+        scripts=scripts,
+        live=payload(shown.data, images) if shown and shown.data and images else None,
+        banner=_banner(report.problems, prediction),
+        problems=report.problems,
+        predicted=expected,
+        marks=marks,
+        axis=axis,
+        prediction=prediction,
+        no_prediction=no_prediction or "There is no prediction.",
+        cost=report.cost,
+        meshed=bool(checked.bodies),
+        tissues=tuple(_rows(tissues, shown.looks)) if shown else (),
+        names=shown.names if shown else (),
+        roles=[
+            (role, ROLE_COLOURS.get(role, "#888888"), ", ".join(t.name for t in tissues if str(t.role) == role))
+            for role in dict.fromkeys(str(tissue.role) for tissue in tissues)
+        ],
+        held=shown.frame.held if shown else (),
+        later=tuple(_later(shown, k, image) for k, image in enumerate(images)) if shown else (),
+        left_out=f"{drawn} of {later} later images are drawn, those of the first pair." if 0 < drawn < later else "",
     )
 
 
@@ -251,8 +235,6 @@ def _later(shown: _Shown, k: int, image: PreviewImage) -> Mapping[str, Any]:
     data, states, frame = shown.data, shown.states, shown.frame
     assert data is not None, "there are later images"
     reference, later = data.references[0], data.later[k]
-    assert reference.slices is not None, "the images of a preview have boxes"
-    assert reference.whole is not None, "the images of a preview have boxes"
     by_role = replace(data, tissues=tuple(replace(t, colour=ROLE_COLOURS.get(t.role, t.colour)) for t in data.tissues))
     backed = replace(by_role, references=(replace(reference, background=image.organs[0]),))
     both = replace(later, both=image.whole[:2])
@@ -264,15 +246,9 @@ def _later(shown: _Shown, k: int, image: PreviewImage) -> Mapping[str, Any]:
     bones = any(tissue.role == "rigid" for tissue in data.tissues)
     return {
         "name": later.name,
-        "slices": tuple(
-            picture_of(p.view.name, partial(slice_svg, backed, p, later, name=f"s{k}{p.view.name}", model=False))
-            for p in first_planes(reference.slices)
-        ),
+        "slices": slices_of(reference.slices, partial(slice_chart, model=False), backed, later),
         "widths": widths_of(reference.slices),
-        "whole": tuple(
-            picture_of(p.view.name, partial(alignment_svg, data, p, both, name=f"a{k}{p.view.name}"))
-            for p in first_planes(reference.whole)
-        ),
+        "whole": slices_of(reference.whole, alignment_chart, data, both),
         "whole_widths": widths_of(image.view),
         "moved": image.motion is not None,
         "greys": any(image.greys),

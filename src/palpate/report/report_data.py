@@ -62,6 +62,11 @@ class ModelSurface:
     distance_fitted: NDArray[np.float32] = field(metadata=MAY_BE_NAN)
     area: NDArray[np.float32]
 
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """Which points (n,) the later image shows."""
+        return np.asarray(np.isfinite(self.distance_fitted) & np.isfinite(self.distance_rest))
+
 
 @dataclass(frozen=True, slots=True)
 class Volume:

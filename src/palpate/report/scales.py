@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
@@ -55,6 +58,16 @@ class Scale:
         known = np.isfinite(place)
         shades = self.table[np.rint(255.0 * np.where(known, place, 0.0)).astype(int)] / 255.0
         return np.where(known[:, None], shades, UNSEEN)
+
+
+def draw_colour_bar(axes: Axes, scale: Scale) -> None:
+    """A horizontal bar of a scale's colours, which fills the axes, with its ticks and its label."""
+    limits = LogNorm(scale.low, scale.high) if scale.logarithmic else Normalize(scale.low, scale.high)
+    colours = ScalarMappable(limits, scale.name)
+    bar = axes.figure.colorbar(colours, cax=axes, orientation="horizontal", label=scale.label)
+    bar.set_ticks([place for place, _ in scale.ticks], labels=[label for _, label in scale.ticks])
+    bar.minorticks_off()
+    bar.outline.set_linewidth(0.5)
 
 
 def distance_scale(voxel_mm: float) -> Scale:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from palpate.report.cut_mesh import cut_mesh, element_moduli, motion_of
 from palpate.report.measured import nice_factor
 from palpate.report.report_data import (
     LaterImage,
-    MeasuredPoints,
     MeasuredState,
     ReportData,
     SliceBox,
@@ -25,9 +25,9 @@ from palpate.report.report_data import (
 )
 from palpate.report.scales import Scale, displacement_scale, modulus_scale
 from palpate.report.section import VIEWS, Plane, cut_image, joined
-from palpate.report.svg import draw_svg
 
 WIDTH_INCHES = 4.6
+DOTTED = (0, (1, 1.6))
 FADED = 0.15  # part of the scale of displacements in which the colours fade, so that what stands still stays grey
 LEAST_ARROW_MM = 1.5  # as it is drawn
 OPACITY = 0.6  # of what is coloured, over the image
@@ -48,73 +48,93 @@ def contour_names(data: ReportData) -> tuple[tuple[str, str], ...]:
     return tuple((data.tissues[i].name, data.tissues[i].colour) for i in drawn)
 
 
-def slice_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str, model: bool = True) -> str:
-    """One slice as SVG: the earlier image under the contours of both images and of the model fitted to `later`.
-
-    model: whether there is one.
-    """
+def slice_chart(figure: Figure, data: ReportData, plane: Plane, later: LaterImage, *, model: bool = True) -> str:
+    """The earlier image under the contours of both images and of the model fitted to `later`, if there is one."""
     reference = data.references[later.reference]
-
-    def draw(figure: Figure) -> None:
-        """Grey values, contours and furniture, one over the other."""
-        axes = _backed(figure, data, reference.background, plane)
-        for surface in later.surfaces:
-            draw_lines(axes, data, plane, surface, gid="layer-after", linewidth=4.0, alpha=0.5)
-        for surface in reference.surfaces:
-            draw_lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0, linestyle=(0, (1, 1.6)))
-        for outline in later.outlines:
-            draw_lines(axes, data, plane, outline, gid="layer-model", colors=["white"], linewidth=1.0)
-        furnish(axes, plane)
-
-    where = _where(plane)
+    paint_contours(_fill(figure, plane), data, plane, later, reference.background)
     outlines = f"{reference.name}, {later.name} and the fitted model" if model else f"{reference.name} and {later.name}"
-    says = f"{where}: {reference.name} under the outlines of {outlines}."
-    return draw_svg(draw, size=_size(plane), name=name, says=says)
+    return f"{_where(plane)}: {reference.name} under the outlines of {outlines}."
 
 
-def stiffness_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -> str:
-    """One slice as SVG: the earlier image under the Young's moduli that were found, and the organs' contours there.
+def stiffness_chart(figure: Figure, data: ReportData, plane: Plane, later: LaterImage) -> str:
+    """The earlier image, that of the mesh, under the Young's moduli that were found; raises as `paint_stiffness`."""
+    paint_stiffness(_fill(figure, plane), data, plane)
+    return f"{_where(plane)}: {modulus_scale(data).label} over {data.references[later.reference].name}."
 
-    Raises `ValueError` where there is no mesh of this image, or no modulus.
+
+def displacement_chart(figure: Figure, data: ReportData, plane: Plane, later: LaterImage) -> str:
+    """The earlier image under the fitted motion; raises as `paint_displacement`."""
+    paint_displacement(_fill(figure, plane), data, plane, later)
+    names = f"from {data.references[later.reference].name} to {later.name}"
+    return f"{_where(plane)}: fitted motion {names}, up to {displacement_scale(later).high:.3g} mm."
+
+
+def paint_contours(
+    axes: Axes, data: ReportData, plane: Plane, later: LaterImage, volume: Volume | None, *, small: bool = False
+) -> None:
+    """A volume under contours: broad of the later image, dotted of the earlier one, white of the fitted model.
+
+    small: thinner ones, in a figure for paper, as below.
     """
-    if later.reference:
-        raise ValueError("the mesh that is kept is that of the first pair of images")
-    scale, values = modulus_scale(data), stiffness_on(data, plane)
-
-    def draw(figure: Figure) -> None:
-        """Grey values under colours, contours and furniture."""
-        reference = data.references[later.reference]
-        axes = figure.add_axes((0, 0, 1, 1))
-        show_shades(axes, plane, coloured(shades_of(data, reference.background, plane), values, scale))
-        for surface in reference.surfaces:
-            draw_lines(axes, data, plane, surface, gid="layer-before", linewidth=1.2)
-        furnish(axes, plane)
-
-    says = f"{_where(plane)}: {scale.label} over {data.references[later.reference].name}."
-    return draw_svg(draw, size=_size(plane), name=name, says=says)
+    thin = 0.75 if small else 1.0
+    show_shades(axes, plane, shades_of(data, volume, plane))
+    for surface in later.surfaces:
+        draw_lines(axes, data, plane, surface, gid="layer-after", linewidth=4.0 * thin, alpha=0.5)
+    draw_outlines(axes, data, plane, data.references[later.reference].surfaces, later.outlines, thin=thin)
+    furnish(axes, plane, small=small)
 
 
-def displacement_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -> str:
-    """One slice as SVG: the earlier image under the length of the fitted motion, and arrows of its part in the plane.
+def draw_outlines(
+    axes: Axes,
+    data: ReportData,
+    plane: Plane,
+    rest: Sequence[TriangleSurface],
+    fitted: Sequence[TriangleSurface],
+    *,
+    thin: float = 1.0,
+) -> None:
+    """Contours of what is at rest, dotted, and as the fitted model carries it, white."""
+    for surface in rest:
+        draw_lines(axes, data, plane, surface, gid="layer-before", linewidth=thin, linestyle=DOTTED)
+    for outline in fitted:
+        draw_lines(axes, data, plane, outline, gid="layer-model", colors=["white"], linewidth=thin)
 
-    Raises `ValueError` where there is no mesh of this image, or no motion.
+
+def paint_stiffness(axes: Axes, data: ReportData, plane: Plane, *, small: bool = False) -> None:
+    """The first reference state under the Young's moduli that were found, and the organs' contours there.
+
+    Raises `ValueError` where there is no mesh, or no modulus.
     """
-    scale, factor = displacement_scale(later), arrow_factor(later)
+    _paint_field(axes, data, plane, stiffness_on(data, plane), modulus_scale(data), small=small)
+    furnish(axes, plane, small=small)
+
+
+def paint_displacement(axes: Axes, data: ReportData, plane: Plane, later: LaterImage, *, small: bool = False) -> None:
+    """The first reference state under the length of the fitted motion, and arrows of its part in the plane.
+
+    Raises `ValueError` where there is no mesh, or no motion.
+    """
     motion = motion_on(data, plane, later)
+    lengths = np.linalg.norm(motion, axis=2)
+    _paint_field(axes, data, plane, lengths, displacement_scale(later), full=FADED, small=small)
+    motion_arrows(axes, plane, motion, arrow_factor(later), small=small)
+    furnish(axes, plane, small=small)
 
-    def draw(figure: Figure) -> None:
-        """Grey values under colours, contours, arrows and furniture."""
-        reference = data.references[later.reference]
-        axes = figure.add_axes((0, 0, 1, 1))
-        shades = shades_of(data, reference.background, plane)
-        show_shades(axes, plane, coloured(shades, np.linalg.norm(motion, axis=2), scale, full=FADED))
-        for surface in reference.surfaces:
-            draw_lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0)
-        motion_arrows(axes, plane, motion, factor)
-        furnish(axes, plane)
 
-    says = f"{_where(plane)}: fitted motion from {data.references[later.reference].name} to {later.name}, up to"
-    return draw_svg(draw, size=_size(plane), name=name, says=f"{says} {scale.high:.3g} mm.")
+def _paint_field(
+    axes: Axes,
+    data: ReportData,
+    plane: Plane,
+    values: NDArray[np.float64],
+    scale: Scale,
+    *,
+    full: float = 0.0,
+    small: bool,
+) -> None:
+    reference = data.references[0]
+    show_shades(axes, plane, coloured(shades_of(data, reference.background, plane), values, scale, full=full))
+    for surface in reference.surfaces:
+        draw_lines(axes, data, plane, surface, gid="layer-before", linewidth=0.8 if small else 1.1)
 
 
 def stiffness_on(data: ReportData, plane: Plane) -> NDArray[np.float64]:
@@ -136,6 +156,11 @@ def arrow_factor(later: LaterImage) -> float:
     return nice_factor(lengths[lengths > 0.0] if (lengths > 0.0).any() else lengths, ARROW_REACH * ARROW_STEP_MM)
 
 
+def longer(factor: float) -> str:
+    """How long arrows are drawn, in words."""
+    return "as long as the motion" if factor == 1.0 else f"{factor:g} times as long as the motion"
+
+
 def motion_arrows(axes: Axes, plane: Plane, motion: NDArray[np.float64], factor: float, *, small: bool = False) -> None:
     """Arrows of a motion (n_up, n_across, 3) mm on a plane, one every `ARROW_STEP_MM`, `factor` times as long.
 
@@ -152,50 +177,29 @@ def motion_arrows(axes: Axes, plane: Plane, motion: NDArray[np.float64], factor:
         _arrows(axes, plane, feet, factor * way[inside], (colour, 0.5 * width if small else width), "layer-motion")
 
 
-def points_svg(data: ReportData, plane: Plane, state: MeasuredState, *, name: str) -> str:
-    """One slice as SVG: the outlines at rest and fitted, and arrows of the measured and the fitted motion near it."""
-    reference, near = data.references[state.reference], 0
+def points_chart(figure: Figure, data: ReportData, plane: Plane, state: MeasuredState) -> str:
+    """The outlines at rest and fitted, and arrows of the measured and the fitted motion near the plane."""
+    reference, axes, near = data.references[state.reference], _fill(figure, plane), 0
+    show_shades(axes, plane, shades_of(data, reference.background, plane))
+    draw_outlines(axes, data, plane, reference.surfaces, state.outlines)
     for of in state.points:
-        near += int(np.count_nonzero(_near(of, plane)))
-
-    def draw(figure: Figure) -> None:
-        """Grey values, contours, arrows and furniture, one over the other."""
-        axes = _backed(figure, data, reference.background, plane)
-        for surface in reference.surfaces:
-            draw_lines(axes, data, plane, surface, gid="layer-before", linewidth=1.0, linestyle=(0, (1, 1.6)))
-        for outline in state.outlines:
-            draw_lines(axes, data, plane, outline, gid="layer-model", colors=["white"], linewidth=1.0)
-        for of in state.points:
-            here = _near(of, plane)
-            _arrows(axes, plane, of.rest[here], state.motion_factor * of.observed[here], SEEN, "layer-seen")
-            _arrows(axes, plane, of.rest[here], state.motion_factor * of.fitted[here], FITTED, "layer-fitted")
-        furnish(axes, plane)
-
-    where = _where(plane)
-    says = f"{where}: measured and fitted motion of {near} points near it, as arrows."
-    return draw_svg(draw, size=_size(plane), name=name, says=says)
+        here = np.abs(of.rest[:, plane.view.normal] - plane.position) <= of.near_mm
+        near += int(np.count_nonzero(here))
+        _arrows(axes, plane, of.rest[here], state.motion_factor * of.observed[here], SEEN, "layer-seen")
+        _arrows(axes, plane, of.rest[here], state.motion_factor * of.fitted[here], FITTED, "layer-fitted")
+    furnish(axes, plane)
+    return f"{_where(plane)}: measured and fitted motion of {near} points near it, as arrows."
 
 
-def alignment_svg(data: ReportData, plane: Plane, later: LaterImage, *, name: str) -> str:
-    """One slice as SVG: the earlier image in cyan over the later one in red, so that what agrees is grey.
-
-    Raises `ValueError` when there are not both.
-    """
+def alignment_chart(figure: Figure, data: ReportData, plane: Plane, later: LaterImage) -> str:
+    """The earlier image in cyan over the later one in red, so that what agrees is grey; `ValueError` without both."""
     if len(later.both) != 2:
         raise ValueError("there are no images to be compared")
-
-    def draw(figure: Figure) -> None:
-        """Both images in one picture, and its furniture."""
-        axes = figure.add_axes((0, 0, 1, 1))
-        first, second = (_brightness(data, volume, plane) for volume in later.both)
-        across, up = plane.axes
-        both = np.stack([second, first, first], axis=2)
-        axes.imshow(both, extent=(across[0], across[-1], up[0], up[-1]), origin="lower", interpolation="none")
-        furnish(axes, plane)
-
+    axes, (first, second) = _fill(figure, plane), (_brightness(data, volume, plane) for volume in later.both)
+    show_shades(axes, plane, np.stack([second, first, first], axis=2))
+    furnish(axes, plane)
     reference = data.references[later.reference].name
-    says = f"{plane.view.name.capitalize()} slice: {reference} in cyan over {later.name} in red; what agrees is grey."
-    return draw_svg(draw, size=_size(plane), name=name, says=says)
+    return f"{plane.view.name.capitalize()} slice: {reference} in cyan over {later.name} in red; what agrees is grey."
 
 
 def _where(plane: Plane) -> str:
@@ -203,10 +207,12 @@ def _where(plane: Plane) -> str:
     return f"{plane.view.name.capitalize()} slice at {'xyz'[plane.view.normal]} = {plane.position:.0f} mm"
 
 
-def _size(plane: Plane) -> tuple[float, float]:
-    """Of a picture of the plane, inches."""
+def _fill(figure: Figure, plane: Plane) -> Axes:
+    """Axes that fill the figure, which is made as large as a picture of the plane."""
     across, up = (float(plane.high[axis] - plane.low[axis]) for axis in (plane.view.across, plane.view.up))
-    return WIDTH_INCHES, WIDTH_INCHES * up / across
+    figure.set_layout_engine("none")
+    figure.set_size_inches(WIDTH_INCHES, WIDTH_INCHES * up / across)
+    return figure.add_axes((0, 0, 1, 1))
 
 
 def furnish(axes: Axes, plane: Plane, *, small: bool = False) -> None:
@@ -234,13 +240,6 @@ def furnish(axes: Axes, plane: Plane, *, small: bool = False) -> None:
     axes.plot(ends, [bottom] * 2, color="white", linewidth=wide, solid_capstyle="butt", path_effects=stroke)
     place = (left, bottom + 0.015 * width)
     axes.text(*place, f"{bar:g} mm", color="white", ha="left", va="bottom", fontsize=size, path_effects=OUTLINE)
-
-
-def _backed(figure: Figure, data: ReportData, volume: Volume | None, plane: Plane) -> Axes:
-    """Axes that fill the figure, with a volume on the plane: its window of greys, its tissues' colours, or black."""
-    axes = figure.add_axes((0, 0, 1, 1))
-    show_shades(axes, plane, shades_of(data, volume, plane))
-    return axes
 
 
 def show_shades(axes: Axes, plane: Plane, shades: NDArray[np.float64]) -> None:
@@ -278,11 +277,6 @@ def coloured(
         strength = np.clip(scale.place(values.ravel()).reshape(values.shape) / full, 0.0, 1.0)
     share = np.where(np.isfinite(values), OPACITY * strength, 0.0)[..., None]
     return np.asarray((1.0 - share) * shades + share * colours)
-
-
-def _near(of: MeasuredPoints, plane: Plane) -> NDArray[np.bool_]:
-    """Which of the points that are drawn (n,) the slice shows."""
-    return np.asarray(np.abs(of.rest[:, plane.view.normal] - plane.position) <= of.near_mm)
 
 
 def _arrows(

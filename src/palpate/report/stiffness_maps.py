@@ -5,24 +5,21 @@ Where the data removed less than half of what was not known, a slice is hatched 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
 from palpate.mesh.locate import located
 from palpate.report.pictures import BESIDE_FRONT, HEIGHT, WIDTH, face_normals, section_faces
 from palpate.report.render import Triangles, render_png
 from palpate.report.report_data import MapSlice, ReportData, TissueMap
-from palpate.report.scales import Scale, shown_stiffness
+from palpate.report.scales import Scale, draw_colour_bar, shown_stiffness
 from palpate.report.section import VIEWS, Plane
-from palpate.report.svg import INK, draw_svg
+from palpate.report.svg import INK
 from palpate.statement.map_summary import RESOLVED, map_summary
 from palpate.statement.result import CaseResult
 from palpate.statement.stiffness_scale import StiffnessScale
@@ -68,42 +65,28 @@ def map_scale(of: TissueMap, shown: StiffnessScale) -> Scale:
     return Scale(COLOURS, ends[0], ends[2], True, shown.label, tuple((end, f"{end:.3g}") for end in ends))
 
 
-def map_svg(data: ReportData, of: TissueMap, *, name: str) -> str:
-    """Slices of a map, beside each the factor e^sd by which its modulus may be off, as SVG.
+def map_chart(figure: Figure, data: ReportData, of: TissueMap) -> str:
+    """Slices of a map, beside each the factor e^sd by which its modulus may be off, and a colour bar under each column.
 
     A length of the one colour bar is the same factor as on the other.
     """
-    says = f"Slices of the modulus inside {data.tissues[of.tissue].name}, and of its standard deviation. {of.words}"
-    size = (2.0 * SIDE_INCHES + 0.6, 3.0 * SIDE_INCHES + 1.2)
-    return draw_svg(map_drawing(data, of), size=size, name=name, says=says)
-
-
-def map_drawing(data: ReportData, of: TissueMap) -> Callable[[Figure], None]:
-    """What paints the slices of a map, and of its standard deviation, on a figure."""
+    figure.set_size_inches(2.0 * SIDE_INCHES + 0.6, 3.0 * SIDE_INCHES + 1.2)
     shown = shown_stiffness(data)
     scale = map_scale(of, shown)
     spread = Scale(COLOURS, 1.0, scale.high / scale.low, True, "factor of one standard deviation", ())
-
-    def draw(figure: Figure) -> None:
-        """Two columns of three slices, and a colour bar under each."""
-        axes = figure.subplots(3, 2, gridspec_kw={"left": 0.02, "right": 0.98, "top": 0.94, "bottom": 0.14})
-        for row, (view, cut) in enumerate(zip(VIEWS, of.slices, strict=True)):
-            plane = Plane(view, float(of.position[view.normal]), of.low, of.high)
-            _slice(axes[row, 0], plane, cut, shown.factor * cut.modulus, scale)
-            _slice(axes[row, 1], plane, cut, np.exp(cut.sd), spread)
-            axes[row, 0].set_title(f"{view.name}, {'xyz'[view.normal]} = {plane.position:.0f} mm", loc="left")
-        for column, of_column in enumerate((scale, spread)):
-            bar = figure.add_axes(((0.06 + 0.5 * column), 0.075, 0.38, 0.02))
-            mapped = ScalarMappable(LogNorm(of_column.low, of_column.high), of_column.name)
-            factors = FACTORS if of_column.high < CLOSE else DECADE
-            places = [place for place, _ in of_column.ticks] or [f for f in factors if f <= of_column.high]
-            drawn = figure.colorbar(mapped, cax=bar, orientation="horizontal", label=of_column.label)
-            drawn.ax.xaxis.set_major_locator(FixedLocator(places))
-            drawn.ax.xaxis.set_minor_locator(NullLocator())
-            drawn.ax.xaxis.set_major_formatter(StrMethodFormatter("{x:.3g}"))
-            drawn.ax.xaxis.set_minor_formatter(NullFormatter())
-
-    return draw
+    figure.set_layout_engine("none")  # the columns are as wide as each other
+    axes = figure.subplots(3, 2, gridspec_kw={"left": 0.02, "right": 0.98, "top": 0.94, "bottom": 0.14})
+    for row, (view, cut) in enumerate(zip(VIEWS, of.slices, strict=True)):
+        plane = Plane(view, float(of.position[view.normal]), of.low, of.high)
+        _slice(axes[row, 0], plane, cut, shown.factor * cut.modulus, scale)
+        _slice(axes[row, 1], plane, cut, np.exp(cut.sd), spread)
+        axes[row, 0].set_title(f"{view.name}, {'xyz'[view.normal]} = {plane.position:.0f} mm", loc="left")
+    for column, of_column in enumerate((scale, spread)):
+        factors = FACTORS if of_column.high < CLOSE else DECADE
+        places = [place for place, _ in of_column.ticks] or [f for f in factors if f <= of_column.high]
+        marked = replace(of_column, ticks=tuple((place, f"{place:.3g}") for place in places))
+        draw_colour_bar(figure.add_axes(((0.06 + 0.5 * column), 0.075, 0.38, 0.02)), marked)
+    return f"Slices of the modulus inside {data.tissues[of.tissue].name}, and of its standard deviation. {of.words}"
 
 
 def _slice(axes: Axes, plane: Plane, cut: MapSlice, values: NDArray[np.float32], scale: Scale) -> None:

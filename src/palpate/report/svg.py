@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Callable, Sequence
 from functools import cache
+from typing import Any
 
 import jinja2
 import matplotlib as mpl
@@ -44,6 +45,14 @@ STYLE = {
 }
 
 
+SIZE = (3.9, 2.5)  # inches, of a chart
+LINK = "palpate-link-"
+PREFIX = "palpate-figure-"  # of a figure's identifiers, until the page has given it a number
+
+Chart = Callable[[Figure], str]
+"""Paints on an empty figure of `SIZE`, or makes that larger, and gives what it shows in words."""
+
+
 @cache
 def template_of(name: str, package: str = "palpate.report") -> jinja2.Template:
     """A page's template, of that package or ours, all that is put into it escaped; a quarter of a page's time."""
@@ -54,6 +63,12 @@ def template_of(name: str, package: str = "palpate.report") -> jinja2.Template:
     return environment.get_template(name)
 
 
+def page_of(template: str, package: str = "palpate.report", **parts: Any) -> str:
+    """A page: the parts put into a template, and the identifiers of each figure in it kept apart by its number."""
+    figures = template_of(template, package).render(**parts).split("<svg ")
+    return "<svg ".join(text.replace(PREFIX, f"f{number}-") for number, text in enumerate(figures))
+
+
 def code_link(code: str) -> Markup:
     """The code of a warning as HTML, with a link to its explanation where there is one."""
     name = Markup("<code>{}</code>").format(code)
@@ -62,7 +77,7 @@ def code_link(code: str) -> Markup:
 
 def link_url(number: int) -> str:
     """What an artist's url is until a figure's link of that number takes its place."""
-    return f"palpate-link-{number}-"
+    return f"{LINK}{number}-"
 
 
 def mark_decades(axis: Axis, *, most: int = MOST) -> None:
@@ -73,23 +88,16 @@ def mark_decades(axis: Axis, *, most: int = MOST) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def draw_svg(
-    draw: Callable[[Figure], None],
-    *,
-    size: tuple[float, float],
-    name: str,
-    says: str,
-    links: Sequence[tuple[str, str]] = (),
-) -> str:
-    """The SVG element that `draw` paints on an empty figure of `size` (inches), and that `says` this to who cannot see.
+def draw_svg(chart: Chart, links: Sequence[tuple[str, str]] = ()) -> str:
+    """The SVG element that a chart paints, which says its words to who cannot see.
 
-    `name`, unique in the page, keeps the figure's identifiers apart from those of others. Elements that `draw` gave
-    the gid "layer-X" get the class "layer-X". links: address of each and what it says, where `draw` gave artists
-    the url `link_url` of its number. No state of matplotlib outlives the call.
+    Its identifiers begin with `PREFIX`. Elements that the chart gave the gid "layer-X" get the class "layer-X". links:
+    address of each and what it says, where the chart gave artists the url `link_url` of its number. No state of
+    matplotlib outlives the call.
     """
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=size)
-        draw(figure)
+        figure = Figure(figsize=SIZE, layout="constrained")
+        says = chart(figure)
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     svg = text.getvalue()
@@ -99,12 +107,12 @@ def draw_svg(
     element = re.sub(r'id="(layer-[a-z]+)[^"]*"', r'class="\1"', element)
     element = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", element, count=1)
     element = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", element, count=1)
-    element = re.sub(r'\bid="', f'id="{name}-', element)
-    element = re.sub(r"url\(#", f"url(#{name}-", element)
-    element = re.sub(r'(xlink:)?href="#', f'href="#{name}-', element)
+    element = re.sub(r'\bid="', f'id="{PREFIX}', element)
+    element = re.sub(r"url\(#", f"url(#{PREFIX}", element)
+    element = re.sub(r'(xlink:)?href="#', f'href="#{PREFIX}', element)
+    role = "group" if LINK in element else "img"  # an image hides what is in it from who cannot see
     for k, (address, words) in enumerate(links):
         link = f'<a href="{escape(address)}" aria-label="{escape(words)}">'
         element = element.replace(f'<a xlink:href="{link_url(k)}" target="_blank">', link)
-    role = "group" if links else "img"  # an image hides what is in it from who cannot see
     element = element.replace("<svg", f'<svg role="{role}" aria-label="{escape(says)}"', 1)
     return element.replace(INK, "currentColor")

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from markupsafe import Markup
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from palpate.report.rows import interval_text, number
-from palpate.report.svg import INK, draw_svg, template_of
+from palpate.report.svg import INK, draw_svg, page_of
 from palpate.report.units import ModulusUnit, shown_unit
 from palpate.statement.variations import NAMES, ratio_change
 
@@ -137,69 +137,58 @@ def sensitivity_table(document: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
-def tornado_svg(document: Mapping[str, Any], tissue: str, *, name: str) -> str:
-    """The tornado of one tissue's modulus as SVG, on a logarithmic axis of E' / E, its 95 % interval as a band.
+def tornado(figure: Figure, document: Mapping[str, Any], tissue: str) -> str:
+    """The tornado of one tissue's modulus on a logarithmic axis of E' / E, its 95 % interval as a band.
 
-    Raises `ValueError` where nothing was varied.
+    A bar a row, blue to the left and orange to the right, a tick a setting. Raises `ValueError` where nothing was
+    varied.
     """
     rows = [row for row in tornado_rows(document, tissue) if row.effects]
     if not rows:
         raise ValueError("nothing was varied")
-    estimate = next(item for item in document["estimates"] if item["tissue"] == tissue)
-    reach = min(1.15 * max(rows[0].size, LEAST), WIDEST)
-    unit = shown_unit(document)
-    value, interval = unit.numbers(estimate)
-    height = 0.8 + 0.3 * len(rows)
+    figure.set_size_inches(7.2, 0.8 + 0.3 * len(rows))
+    axes, unit, reach = figure.subplots(), shown_unit(document), min(1.15 * max(rows[0].size, LEAST), WIDEST)
+    value, interval = unit.numbers(next(item for item in document["estimates"] if item["tissue"] == tissue))
+    if value and interval:
+        low, high = (math.log(e / value) if e else sign * reach for e, sign in zip(interval, (-1, 1), strict=True))
+        axes.axvspan(max(low, -reach), min(high, reach), color=INK, alpha=0.1, linewidth=0)
+    for place, row in enumerate(rows):
+        for end, colour in zip(row.ends, COLOURS, strict=True):
+            axes.barh(place, max(-reach, min(end, reach)), height=0.62, color=colour, alpha=0.85)
+            if abs(end) > reach:
+                marker = ">" if end > 0.0 else "<"
+                axes.plot(math.copysign(reach, end), place, marker=marker, color=INK, markersize=6, clip_on=False)
+        inside = [change for change in row.effects.values() if abs(change) <= reach]
+        axes.plot(inside, [place] * len(inside), "|", color=INK, markersize=7)
+    axes.axvline(0.0, color=INK, linewidth=0.9)
     labels = [row.label if len(row.label) <= LETTERS else f"{row.label[: LETTERS - 3]}..." for row in rows]
+    axes.set_yticks(range(len(rows)), labels)
     marks = [1.0]  # round ratios within the axis, not closer than a twelfth of it
     for mark in sorted(MARKS, key=lambda m: -abs(math.log(m))):
         apart = min(abs(math.log(mark / other)) for other in marks)
         if abs(math.log(mark)) <= reach and apart >= reach / 6.0:
             marks.append(mark)
-
-    def draw(figure: Figure) -> None:
-        """A bar a row, blue to the left and orange to the right, a tick a setting."""
-        axes = figure.add_axes((0.36, 0.55 / height, 0.61, 1.0 - 0.65 / height))
-        if value and interval:
-            low, high = (math.log(e / value) if e else sign * reach for e, sign in zip(interval, (-1, 1), strict=True))
-            axes.axvspan(max(low, -reach), min(high, reach), color=INK, alpha=0.1, linewidth=0)
-        for place, row in enumerate(rows):
-            for end, colour in zip(row.ends, COLOURS, strict=True):
-                axes.barh(place, max(-reach, min(end, reach)), height=0.62, color=colour, alpha=0.85)
-                if abs(end) > reach:
-                    marker = ">" if end > 0.0 else "<"
-                    axes.plot(math.copysign(reach, end), place, marker=marker, color=INK, markersize=6, clip_on=False)
-            inside = [change for change in row.effects.values() if abs(change) <= reach]
-            axes.plot(inside, [place] * len(inside), "|", color=INK, markersize=7)
-        axes.axvline(0.0, color=INK, linewidth=0.9)
-        axes.set_yticks(range(len(rows)), labels)
-        axes.set_ylim(len(rows) - 0.4, -0.6)
-        axes.set_xlim(-reach, reach)
-        axes.xaxis.set_major_locator(FixedLocator([math.log(m) for m in marks]))
-        axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{math.exp(x):.3g}"))
-        changed = "modulus" if unit.name == "kPa" else f"ratio to {unit.relative_to[:LETTERS]}"
-        axes.set_xlabel(f"{changed} / its estimate (no unit)")
-        axes.grid(visible=True, axis="x")
-
-    listing = "; ".join(f"{row.label}: {effect_text(row)}" for row in rows)
-    return draw_svg(draw, size=(7.2, height), name=name, says=f"Tornado of {tissue}: {listing}.")
+    axes.set_xticks([math.log(mark) for mark in marks], [f"{mark:.3g}" for mark in marks])
+    changed = "modulus" if unit.name == "kPa" else f"ratio to {unit.relative_to[:LETTERS]}"
+    axes.set(xlim=(-reach, reach), ylim=(len(rows) - 0.4, -0.6), xlabel=f"{changed} / its estimate (no unit)")
+    axes.grid(visible=True, axis="x")
+    return f"Tornado of {tissue}: {'; '.join(f'{row.label}: {effect_text(row)}' for row in rows)}."
 
 
 def sensitivity_page(document: Mapping[str, Any]) -> str:
     """The page of a document sensitivity.json; all names in it are escaped."""
     tissues, unit = [], shown_unit(document)
-    for place, item in enumerate(document["estimates"]):
+    for item in document["estimates"]:
         value, interval = unit.numbers(item)
-        tissue = item["tissue"]
+        chart = draw_svg(partial(tornado, document=document, tissue=item["tissue"]))
         tissues.append(
             {
-                "name": tissue,
+                "name": item["tissue"],
                 "value": number(value),
                 "unit": unit.text,
                 "interval": interval_text(interval),
-                "chart": Markup(tornado_svg(document, tissue, name=f"tornado{place}")),  # noqa: S704 - ours
-                "rows": [(row, effect_text(row)) for row in tornado_rows(document, tissue)],
+                "chart": Markup(chart),  # noqa: S704 - ours
+                "rows": [(row, effect_text(row)) for row in tornado_rows(document, item["tissue"])],
             }
         )
-    return str(template_of("sensitivity.html").render(document=document, tissues=tissues, unit=unit))
+    return page_of("sensitivity.html", document=document, tissues=tissues, unit=unit)

@@ -9,17 +9,19 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from palpate.errors import EstimationError, InputDataError
 from palpate.progress import Line, Progress, silent
-from palpate.report.figures.maps import map_sheet
 from palpate.report.figures.moduli import chosen_unit, moduli_sheet
 from palpate.report.figures.motion import motion_caption, motion_gif
 from palpate.report.figures.residuals import residual_sheet
-from palpate.report.figures.sheet import Sheet
+from palpate.report.figures.sheet import figure_files
 from palpate.report.figures.slices import before_after_sheet, displacement_sheet, stiffness_sheet
-from palpate.report.report_data import ReportData
+from palpate.report.report_data import ReportData, TissueMap
 from palpate.report.rows import moduli_in
+from palpate.report.scales import shown_stiffness
+from palpate.report.stiffness_maps import map_chart
 from palpate.report.units import ModulusUnit, shown_unit
 from palpate.study.outputs import write_bytes, write_text
 
@@ -98,30 +100,42 @@ _Make = Callable[[Sequence[str], int], tuple[dict[str, bytes], str]]
 
 def _drawings(data: ReportData, units: Sequence[ModulusUnit]) -> Iterator[tuple[str, _Make]]:
     """The name of each figure, and what makes its files and its caption for formats and dpi."""
+
+    def of_chart(name: str, chart: Callable[..., str], *arguments: object) -> tuple[str, _Make]:
+        """One that is drawn in all formats."""
+        return name, lambda formats, dpi: figure_files(name, lambda figure: chart(figure, *arguments), formats, dpi=dpi)
+
     colours = {tissue.name: tissue.colour for tissue in data.tissues}
     for unit in units:
-        yield f"moduli-{unit.name.lower()}", partial(_of_sheet, partial(moduli_sheet, data.document, colours, unit))
+        yield of_chart(f"moduli-{unit.name.lower()}", moduli_sheet, data.document, colours, unit)
     if data.references:
-        yield "stiffness-slices", partial(_of_sheet, partial(stiffness_sheet, data))
-    for number in range(len(data.maps)):
-        yield f"map-{number + 1}", partial(_of_sheet, partial(map_sheet, data, number))
-    for number, later in enumerate(data.later):
-        yield f"before-after-{number + 1}", partial(_of_sheet, partial(before_after_sheet, data, number))
+        yield of_chart("stiffness-slices", stiffness_sheet, data)
+    for number, of in enumerate(data.maps, start=1):
+        yield of_chart(f"map-{number}", map_sheet, data, of)
+    for number, later in enumerate(data.later, start=1):
+        yield of_chart(f"before-after-{number}", before_after_sheet, data, later)
         if later.model:
-            yield f"residuals-{number + 1}", partial(_of_sheet, partial(residual_sheet, data, number))
+            yield of_chart(f"residuals-{number}", residual_sheet, data, later)
         if later.reference == 0:  # whose mesh is kept
-            yield f"displacement-{number + 1}", partial(_of_sheet, partial(displacement_sheet, data, number))
-            yield f"motion-{number + 1}", partial(_animation, data, number)
+            yield of_chart(f"displacement-{number}", displacement_sheet, data, later)
+            yield f"motion-{number}", partial(_animation, data, number)
 
 
-def _of_sheet(make: Callable[[], Sheet], formats: Sequence[str], dpi: int) -> tuple[dict[str, bytes], str]:
-    sheet = make()
-    return sheet.files(formats, dpi=dpi), sheet.caption
+def map_sheet(figure: Figure, data: ReportData, of: TissueMap) -> str:
+    """A map as the page has it, with its caption."""
+    map_chart(figure, data, of)
+    return (
+        f"Map of stiffness inside {data.tissues[of.tissue].name}, in three slices. Left:"
+        f" {shown_stiffness(data).label}. Right: the factor by which it may be off (one standard deviation of its"
+        " logarithm). Both bars are logarithmic. Hatched: the data removed less than half of what was not known; there"
+        f" the mean of the tissue is shown. {of.words}"
+    )
 
 
 def _animation(data: ReportData, number: int, formats: Sequence[str], dpi: int) -> tuple[dict[str, bytes], str]:
     del formats, dpi  # a GIF has its own size
-    return {f"motion-{number + 1}.gif": motion_gif(data, number)}, motion_caption(data, number)
+    later = data.later[number - 1]
+    return {f"motion-{number}.gif": motion_gif(data, later)}, motion_caption(data, later)
 
 
 def _refuse(data: ReportData) -> None:

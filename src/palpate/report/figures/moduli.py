@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from palpate.errors import ConfigurationError
-from palpate.report.figures.sheet import COLUMN_MM, Sheet
+from palpate.report.figures.sheet import COLUMN_MM, size_mm
 from palpate.report.rows import interval_text, moduli_in, number
 from palpate.report.svg import mark_decades
 from palpate.report.units import ModulusUnit, UnitName, shown_unit
@@ -86,23 +86,19 @@ def _row(axes: Axes, row: int, item: Mapping[str, Any], colour: str, unit: Modul
     axes.annotate(words, (value, row), (0, 6), textcoords="offset points", ha="center", va="bottom", fontsize="smaller")
 
 
-def moduli_sheet(document: Mapping[str, Any], colours: Mapping[str, str], unit: ModulusUnit) -> Sheet:
-    """The figure in one column, in that unit."""
+def moduli_sheet(figure: Figure, document: Mapping[str, Any], colours: Mapping[str, str], unit: ModulusUnit) -> str:
+    """The figure in one column, in that unit, and its caption."""
     items = moduli_in(document)
-
-    def draw(figure: Figure) -> None:
-        """The axes alone."""
-        figure.set_layout_engine("constrained")
-        draw_moduli(figure.add_subplot(), document, colours, unit)
-
+    size_mm(figure, COLUMN_MM, FRAME_MM + ROW_MM * max(len(items), 1))
+    figure.set_layout_engine("constrained")
+    draw_moduli(figure.add_subplot(), document, colours, unit)
     what = (
         "Young's modulus in kPa" if unit.name == "kPa" else f"Young's modulus as a ratio to that of {unit.relative_to}"
     )
     truth = any(unit.truth(item) is not None for item in items)
-    caption = (
+    return (
         f"{what}, for each tissue that was estimated. Dots are the estimates, bars their 95 % intervals; the axis is"
         " logarithmic. An arrow marks an end that the images leave open."
         + (" The dashed line is the true value of the simulation." if truth else "")
         + " The word under each name is the verdict of the program."
     )
-    return Sheet(f"moduli-{unit.name.lower()}", caption, COLUMN_MM, FRAME_MM + ROW_MM * max(len(items), 1), draw)

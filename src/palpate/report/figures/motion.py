@@ -16,7 +16,7 @@ from PIL import Image
 from palpate.report.cut_mesh import cut_mesh, motion_of
 from palpate.report.figures.sheet import MM, PAGE_MM, STYLE
 from palpate.report.figures.slices import LEGEND_MM, TITLE_MM, legend, strip_of
-from palpate.report.report_data import ReportData, TriangleSurface, Volume
+from palpate.report.report_data import LaterImage, ReportData, TriangleSurface, Volume
 from palpate.report.section import Plane
 from palpate.report.slices import draw_lines, furnish, shades_of, show_shades
 
@@ -27,9 +27,8 @@ MOST_COLOURS = 256  # of a GIF
 UNKNOWN = 0.08  # brightness of what the motion uncovers, of which nothing is known
 
 
-def motion_gif(data: ReportData, number: int) -> bytes:
-    """The motion to a later image (its number) there and back, as GIF; raises `ValueError` where none is kept."""
-    later = data.later[number]
+def motion_gif(data: ReportData, later: LaterImage) -> bytes:
+    """The motion to a later image there and back, as GIF; raises `ValueError` where none is kept."""
     reference, motion, strip = data.references[later.reference], motion_of(later), strip_of(data, later.reference)
     surfaces = {surface.tissue: surface for surface in reference.surfaces}
     moving = [
@@ -83,9 +82,8 @@ def _palette(colours: Sequence[str]) -> Image.Image:
     return palette
 
 
-def motion_caption(data: ReportData, number: int) -> str:
+def motion_caption(data: ReportData, later: LaterImage) -> str:
     """What the animation shows."""
-    later = data.later[number]
     name = data.references[later.reference].name
     return (
         f"Animation of the fitted motion from {name} to {later.name} and back. It shows {name} and its contours as the"

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+
+from palpate.report.svg import Chart
 
 COLUMN_MM, PAGE_MM = 85.0, 170.0  # one and two columns of most journals
 MM = 1.0 / 25.4  # inches
@@ -38,31 +39,21 @@ METADATA = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Sheet:
-    """A figure before it is drawn: its name as a file's, its caption, and its size in mm.
+def size_mm(figure: Figure, width: float, height: float) -> None:
+    """Give a figure its width and height in mm."""
+    figure.set_size_inches(width * MM, height * MM)
 
-    draw: paints it on an empty figure of that size.
+
+def figure_files(name: str, chart: Chart, formats: Sequence[str], *, dpi: int) -> tuple[dict[str, bytes], str]:
+    """A figure by the names of its files, and its caption, which are the words of its chart.
+
+    dpi: of PNG, and of the pictures inside SVG and PDF.
     """
-
-    name: str
-    caption: str
-    width_mm: float
-    height_mm: float
-    draw: Callable[[Figure], None]
-
-    def figure(self) -> Figure:
-        """The figure; call it under `STYLE`."""
-        figure = Figure(figsize=(self.width_mm * MM, self.height_mm * MM))
-        self.draw(figure)
-        return figure
-
-    def files(self, formats: Sequence[str], *, dpi: int) -> dict[str, bytes]:
-        """The figure by the names of its files; dpi: of PNG, and of the pictures inside SVG and PDF."""
-        with mpl.rc_context(STYLE):
-            figure, found = self.figure(), dict[str, bytes]()
-            for kind in formats:
-                memory = io.BytesIO()
-                figure.savefig(memory, format=kind, dpi=dpi, metadata=METADATA[kind])
-                found[f"{self.name}.{kind}"] = memory.getvalue()
-        return found
+    with mpl.rc_context(STYLE):
+        figure, found = Figure(), dict[str, bytes]()
+        caption = chart(figure)
+        for kind in formats:
+            memory = io.BytesIO()
+            figure.savefig(memory, format=kind, dpi=dpi, metadata=METADATA[kind])
+            found[f"{name}.{kind}"] = memory.getvalue()
+    return found, caption
