@@ -133,7 +133,7 @@ def test_every_pair_has_its_own_figures_from_its_own_images(two_pairs, tmp_path)
     assert "the mesh of the first pair" in page
     facts = json.loads(re.search(r'id="facts">(.*?)</script>', page, flags=re.DOTALL).group(1))
     assert [later["reference"] for later in facts["later"]] == [0, 1]
-    lows = [np.array(reference["box"]["low"]) for reference in facts["references"]]
+    lows = [np.array(reference["slices"]["low"]) for reference in facts["references"]]
     np.testing.assert_allclose(lows[1] - lows[0], [0.0, 0.0, 50.0], atol=1e-9)
     assert "could not be" not in page[: page.index("<script")]
 

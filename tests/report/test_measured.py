@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import io
 import json
+import math
 import re
 import zlib
 
@@ -66,7 +67,7 @@ def facts_of(data):
 
 def floats(entry, block):
     assert entry["type"] == "float32"
-    return np.frombuffer(block, "<f4", entry["length"], entry["offset"]).reshape(-1, 3)
+    return np.frombuffer(block, "<f4", math.prod(entry["shape"]), entry["offset"]).reshape(entry["shape"])
 
 
 def test_an_arrow_lies_where_its_marker_lies(measured):

@@ -61,7 +61,7 @@ Palpate.Mesh = class {
     for (let i = cut.axis; i < this.mesh.nodes.length; i += 3) {
       low = Math.min(low, this.mesh.nodes[i]); high = Math.max(high, this.mesh.nodes[i]);
     }
-    const box = this.facts.references.length ? this.facts.references[0].box : null;
+    const box = this.facts.references.length ? this.facts.references[0].slices : null;
     const start = box ? box.position[cut.axis] : centre[cut.axis];
     Object.assign(this.slider, { min: low, max: high, step: 0.5, value: start });
     this.build();

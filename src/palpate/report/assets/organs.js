@@ -75,8 +75,8 @@ Palpate.Organs = class {
   paint(geometry, m, share) {
     const places = geometry.attributes.position.array, colours = geometry.attributes.color.array;
     for (let i = 0; i < places.length; i++) places[i] = m.rest[i] + share * (m.fitted[i] - m.rest[i]);
-    for (let i = 0; i < m.distanceRest.length; i++) {
-      this.later.scale.colour((1 - share) * m.distanceRest[i] + share * m.distanceFitted[i], colours, 3 * i);
+    for (let i = 0; i < m.distance_rest.length; i++) {
+      this.later.scale.colour((1 - share) * m.distance_rest[i] + share * m.distance_fitted[i], colours, 3 * i);
     }
     for (let i = 0; i < colours.length; i++) colours[i] = Math.pow(colours[i], 2.2); // three.js blends in linear light
     geometry.attributes.position.needsUpdate = geometry.attributes.color.needsUpdate = true;

@@ -9,9 +9,9 @@ Palpate.arrowsAsked = (state, section) => {
   return shown.map((p) => {
     if (mode === "left") {
       p.left = p.left || p.observed.map((value, i) => value - p.fitted[i]);
-      return { ...p, arrows: [[p.left, state.leftFactor, "left"]] };
+      return { ...p, arrows: [[p.left, state.left_factor, "left"]] };
     }
-    const factor = mode === "true" ? 1 : state.motionFactor;
+    const factor = mode === "true" ? 1 : state.motion_factor;
     return { ...p, arrows: [[p.observed, factor, "seen"], [p.fitted, factor, "fitted"]] };
   });
 };
@@ -43,7 +43,7 @@ Palpate.PointSlices = class extends Palpate.Planes {
     let near = 0;
     for (const p of Palpate.arrowsAsked(this.later, this.section)) {
       const here = [];
-      for (let i = 0; i < p.rest.length; i += 3) if (Math.abs(p.rest[i + view.normal] - this.position[view.normal]) <= p.near) here.push(i);
+      for (let i = 0; i < p.rest.length; i += 3) if (Math.abs(p.rest[i + view.normal] - this.position[view.normal]) <= p.near_mm) here.push(i);
       near += here.length;
       for (const [way, factor, kind] of p.arrows) {
         for (const i of here) {

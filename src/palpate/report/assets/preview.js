@@ -5,11 +5,11 @@ const FACES = [0, 1, 3, 0, 3, 2, 4, 6, 7, 4, 7, 5, 0, 4, 5, 0, 5, 1, 2, 3, 7, 2,
 Palpate.Preview = class extends Palpate.Planes {
   constructor(facts, number, section) {
     const later = facts.later[number], reference = facts.references[later.reference], whole = section.dataset.box === "whole";
-    super(facts, later, section, whole ? facts.preview[number].view : reference.box);
+    super(facts, later, section, whole ? facts.preview[number].view : reference.slices);
     this.own = facts.preview[number];
     this.shown = whole ? this.own.whole : this.own.organs;
     this.held = [["frame", this.own.frame, "#ffffff", []], ["field", this.own.field, "#ff6f59", [7, 5]]]
-      .map(([key, points, colour, dash]) => ({ key, colour, dash, points: Float32Array.from(points), triangles: FACES }));
+      .map(([key, points, colour, dash]) => ({ key, colour, dash, points: Float32Array.from(points.flat()), triangles: FACES }));
     this.fade = section.querySelector(".fade");
     this.button = section.querySelector(".play");
     this.fade.addEventListener("input", () => { this.play(false); this.draw(); });
@@ -88,7 +88,7 @@ Palpate.Preview = class extends Palpate.Planes {
   }
 
   // The motion of a tissue's middle as it lies in the plane, longer than it is.
-  arrow(context, view, frame, { start, end }) {
+  arrow(context, view, frame, [, start, end]) {
     const at = (p) => [frame.x(p[view.across]), frame.y(p[view.up])];
     const tip = start.map((value, k) => value + this.own.factor * (end[k] - value));
     const [x0, y0] = at(start), [x1, y1] = at(tip), long = Math.hypot(x1 - x0, y1 - y0);

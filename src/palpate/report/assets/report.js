@@ -12,58 +12,19 @@ Palpate.inflate = async (base64) => {
 
 const TYPES = { uint8: Uint8Array, int16: Int16Array, uint16: Uint16Array, uint32: Uint32Array, float32: Float32Array };
 
+// The facts with their arrays, each with its shape; points come back from steps of 16 bits.
 Palpate.load = async () => {
-  const facts = JSON.parse(document.getElementById("facts").textContent);
   const block = await Palpate.inflate(document.getElementById("block").textContent.trim());
-  const array = (entry) => new TYPES[entry.type](block, entry.offset, entry.length);
-  const points = (entry) => {
-    const steps = array(entry), places = new Float32Array(steps.length);
-    const [x, y, z] = facts.low, step = facts.step;
-    for (let i = 0; i < steps.length; i += 3) {
-      places[i] = x + step * steps[i];
-      places[i + 1] = y + step * steps[i + 1];
-      places[i + 2] = z + step * steps[i + 2];
-    }
-    return places;
+  const array = ({ type, offset, shape, low, step }) => {
+    let values = new TYPES[type](block, offset, shape.reduce((count, n) => count * n, 1));
+    if (low) values = Float32Array.from(values, (steps, i) => low[i % 3] + step * steps);
+    return Object.assign(values, { shape });
   };
-  const surface = (entry) => ({ tissue: entry.tissue, points: points(entry.points), triangles: array(entry.triangles) });
-  const volume = (entry) => entry && { ...entry, values: array(entry.values) };
-  for (const reference of facts.references) {
-    reference.surfaces = reference.surfaces.map(surface);
-    reference.background = volume(reference.background);
-  }
-  for (const later of facts.later) {
-    later.surfaces = later.surfaces.map(surface);
-    later.background = volume(later.background);
-    later.both = later.both.map(volume);
-    later.outlines = later.outlines.map(surface);
-    later.scale = Palpate.scale(later.scale);
-    if (later.motion) {
-      const { values, step, scale, factor } = later.motion;
-      later.motion = { values: Float32Array.from(array(values), (steps) => step * steps), scale: Palpate.scale(scale), factor };
-    }
-    later.model = later.model.map((m) => ({
-      tissue: m.tissue, triangles: array(m.triangles), rest: points(m.rest), fitted: points(m.fitted),
-      distanceRest: array(m.distanceRest), distanceFitted: array(m.distanceFitted),
-    }));
-  }
-  for (const state of facts.measured) {
-    state.outlines = state.outlines.map(surface);
-    state.points = state.points.map((p) => ({ near: p.near, rest: array(p.rest), observed: array(p.observed), fitted: array(p.fitted) }));
-  }
-  for (const image of facts.preview) for (const key of ["organs", "whole", "greys"]) image[key] = image[key].map(volume);
-  if (facts.mesh) {
-    const m = facts.mesh;
-    facts.mesh = {
-      nodes: points(m.nodes), tets: array(m.tets), region: array(m.region), worst: array(m.worst),
-      modulus: array(m.modulus),
-      strain: Float32Array.from(array(m.strain), (steps) => m.strainStep * steps), // per cent
-    };
-  }
-  facts.angles = Palpate.scale(facts.angles);
-  facts.strains = Palpate.scale(facts.strains);
-  facts.moduli = facts.moduli && Palpate.scale(facts.moduli);
-  return facts;
+  const unpacked = (key, value) => {
+    if (value && value.type) return array(value);
+    return value && value.table ? Palpate.scale(value) : value;
+  };
+  return JSON.parse(document.getElementById("facts").textContent, unpacked);
 };
 
 // A colour scale: colour(value, into, place) writes three numbers from 0 to 1; grey where there is no value.

@@ -60,7 +60,7 @@ Palpate.join = (segments, next, place) => {
 // One slice of a volume as a picture of its own pixels; grey values between two layers are blended.
 // greys: brightness (0 to 255) of each step of a grey volume; colours: [r, g, b] of each number of a label volume.
 Palpate.layer = (volume, view, position, greys, colours) => {
-  const { shape, origin, step } = volume, jump = [shape[1] * shape[2], shape[2], 1];
+  const { origin, step, values: { shape } } = volume, jump = [shape[1] * shape[2], shape[2], 1];
   const w = shape[view.across], h = shape[view.up], n = shape[view.normal];
   const canvas = document.createElement("canvas");
   canvas.width = w; canvas.height = h;
@@ -153,7 +153,7 @@ Palpate.Planes = class {
     const row = this.section.querySelector(".greys"), volume = this.volumes().find((v) => v && v.kind === "grey");
     if (!row || !volume) return;
     const width = row.querySelector(".window-width"), level = row.querySelector(".window-level"), told = row.querySelector("output");
-    const [least, most] = volume.span, step = volume.unit === "HU" ? 1 : (most - least) / volume.steps;
+    const [least, most] = volume.span, step = volume.unit === "HU" ? 1 : (most - least) / this.facts.grey_steps;
     Object.assign(width, { min: step, max: most - least, step });
     Object.assign(level, { min: least, max: most, step });
     const set = () => {
@@ -175,7 +175,7 @@ Palpate.Planes = class {
 
   greys(volume) {
     const [low, high] = this.window || volume.window, [least, most] = volume.span;
-    return Uint8ClampedArray.from({ length: volume.steps + 1 }, (_, i) => 255 * (least + (i * (most - least)) / volume.steps - low) / (high - low));
+    return Uint8ClampedArray.from({ length: this.facts.grey_steps + 1 }, (_, i) => 255 * (least + (i * (most - least)) / this.facts.grey_steps - low) / (high - low));
   }
 
   // Dark enough for lines to stand out.
@@ -214,10 +214,10 @@ Palpate.Planes = class {
       layers.set(volume, { key, picture });
     }
     context.imageSmoothingEnabled = volume.kind === "grey";
-    const half = (k) => volume.step[k] / 2, last = (k) => volume.origin[k] + (volume.shape[k] - 1) * volume.step[k];
+    const half = (k) => volume.step[k] / 2, last = (k) => volume.origin[k] + (volume.values.shape[k] - 1) * volume.step[k];
     const left = frame.x(last(view.across) + half(view.across)), top = frame.y(last(view.up) + half(view.up));
-    const wide = volume.shape[view.across] * volume.step[view.across] * frame.scale;
-    context.drawImage(layers.get(volume).picture, left, top, wide, volume.shape[view.up] * volume.step[view.up] * frame.scale);
+    const wide = volume.values.shape[view.across] * volume.step[view.across] * frame.scale;
+    context.drawImage(layers.get(volume).picture, left, top, wide, volume.values.shape[view.up] * volume.step[view.up] * frame.scale);
   }
 
   stroke(context, view, frame, surface, layers, style) {
@@ -263,7 +263,7 @@ Palpate.Planes = class {
 // The organs' outlines over the image of one state or the other, and what the model found in colours between them.
 Palpate.Slices = class extends Palpate.Planes {
   constructor(facts, number, section) {
-    super(facts, facts.later[number], section, facts.references[facts.later[number].reference].box);
+    super(facts, facts.later[number], section, facts.references[facts.later[number].reference].slices);
     this.phase = "after";
     for (const input of section.querySelectorAll(".legend input")) input.addEventListener("change", () => this.draw());
     for (const input of section.querySelectorAll(".modes .states input")) input.addEventListener("change", () => this.flicker());

@@ -25,7 +25,7 @@
   };
   for (const section of document.querySelectorAll("section.slices")) {
     const number = Number(section.dataset.later);
-    if (facts.references[facts.later[number].reference].box) soon(section, () => new Palpate.Slices(facts, number, section));
+    if (facts.references[facts.later[number].reference].slices) soon(section, () => new Palpate.Slices(facts, number, section));
   }
   for (const section of document.querySelectorAll("section.alignment")) {
     const number = Number(section.dataset.later);
