@@ -1,6 +1,6 @@
 """The geometry and the images of a report as the page's scripts read them: JSON and one deflated block of bytes.
 
-The JSON has the names of the dataclasses' fields. Where it would hold many numbers, it says where these are in the block.
+The JSON has the names of the dataclasses' fields. In the place of many numbers it says where these are in the block.
 """
 
 from __future__ import annotations
