@@ -1,28 +1,31 @@
-"""The time of the same gradient on the same mesh by torch-fem, scikit-fem, finite differences, and Palpate.
+"""Other programs that speed.py compares with: torch-fem's gradient, and the direct solvers PARDISO and SuperLU.
 
-All get the misfit with closest points and weights frozen, a quadratic form in the surface's displacement, so that what
-is timed is the mechanics. Each returns the gradient (n_unknowns,) of it, or is None when it is not installed.
+torch-fem gets the misfit with closest points and weights frozen, a quadratic form in the surface's displacement, so
+that what is timed is the mechanics. A program that is not installed is None. The direct solvers get the order that
+METIS finds on the graph of the nodes.
 """
 
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.optimize import least_squares
 from scipy.sparse.linalg import splu
 
-from palpate.inversion import InverseProblem, InversionSettings, Objective
-from palpate.mechanics import LinearSystem
-from palpate.observation import SEGMENTATION_NOISE, SurfaceDistance
+from multifrontal import nested_dissection
+from palpate.inversion import InverseProblem, Objective
 
 Array = NDArray[np.float64]
 Gradient = Callable[[], Array]
+Matrix = sparse.csr_matrix
+Solve = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -84,22 +87,14 @@ def reduced(objective: Objective, frozen: FrozenMisfit, unknowns: Array) -> Grad
     return gradient
 
 
-def torch_fem_modules() -> tuple[Any, Any, Any] | None:
-    """Torch in double precision, torch-fem's solid and its elasticity; None where they are not installed."""
+def torch_fem(problem: InverseProblem, frozen: FrozenMisfit, unknowns: Array) -> Gradient | None:
+    """Backward through torch-fem's solve: P2 tetrahedra, the moduli by tissue, the wall's modes as displacements."""
     try:
         torch, solid = importlib.import_module("torch"), importlib.import_module("torchfem.solid")
         elastic = importlib.import_module("torchfem.materials.elasticity")
     except ImportError:
         return None
     torch.set_default_dtype(torch.float64)
-    return torch, solid, elastic
-
-
-def torch_fem(problem: InverseProblem, frozen: FrozenMisfit, unknowns: Array) -> Gradient | None:
-    """Backward through torch-fem's solve: P2 tetrahedra, the moduli by tissue, the wall's modes as displacements."""
-    if (modules := torch_fem_modules()) is None:
-        return None
-    torch, solid, elastic = modules
     model, mapping = problem.states[0].model, problem.parameters
     space, constraint = model.space, model.constraint
     n_dof, n = 3 * len(space.points), mapping.n_parameters
@@ -121,7 +116,7 @@ def torch_fem(problem: InverseProblem, frozen: FrozenMisfit, unknowns: Array) ->
         body = solid.Solid(nodes, cells, elastic.IsotropicElasticity3D(moduli[place], poisson))
         body.constraints = held.reshape(-1, 3)
         body.displacements = (modes @ amounts + offset).reshape(-1, 3)
-        solution = body.solve(differentiable_parameters=(theta, amounts), method=METHOD)[0]
+        solution = body.solve(differentiable_parameters=(theta, amounts), method="direct")[0]
         residual = design @ solution.ravel() + rest
         value = 0.5 * residual @ residual + 0.5 * amounts @ amounts
         value.backward()
@@ -130,82 +125,35 @@ def torch_fem(problem: InverseProblem, frozen: FrozenMisfit, unknowns: Array) ->
     return gradient
 
 
-METHOD = "direct"  # PARDISO where it is installed: at these sizes several times faster than its multigrid
+def pardiso(matrix: Matrix) -> Solve:
+    """Symmetric positive definite, our order, without its own refinement, which trebles the price of a solution."""
+    files = importlib.metadata.files("mkl") or []
+    found = [path for file in files if "mkl_rt" in file.name and (path := Path(str(file.locate())).resolve()).exists()]
+    if found:  # else every factorisation searches the whole environment for MKL
+        os.environ.setdefault("PYPARDISO_MKL_RT", str(found[0]))
+    pypardiso = importlib.import_module("pypardiso")
+    upper = sparse.csr_matrix(sparse.triu(matrix, format="csr"))
+    upper.sort_indices()
+    solver = pypardiso.PyPardisoSolver(mtype=2, size_limit_storage=np.inf)
+    for number, value in {1: 1, 5: 1, 8: 0}.items():
+        solver.set_iparm(number, value)
+    solver.perm = (nested_dissection(matrix) + 1).astype(np.int32)
+    solver.factorize(upper)
+    solver.factorized_A = upper  # the wrapper would keep a copy to compare with
+    return lambda rhs: np.asarray(solver.solve(upper, np.asfortranarray(rhs)))
 
 
-def scikit_fem(problem: InverseProblem, frozen: FrozenMisfit, unknowns: Array) -> Gradient | None:
-    """Assembly by scikit-fem, SuperLU, and the adjoint by hand; the stiffness of each tissue is assembled once."""
-    try:
-        fem = importlib.import_module("skfem")
-        elasticity = importlib.import_module("skfem.models.elasticity")
-    except ImportError:
-        return None
-    model, mapping = problem.states[0].model, problem.parameters
-    space, constraint = model.space, model.constraint
-    mesh = fem.MeshTet(np.ascontiguousarray(space.mesh.nodes.T), np.ascontiguousarray(space.mesh.tets.T))
-    basis = fem.Basis(mesh, fem.ElementVector(fem.ElementTetP2()), intorder=2)
-    parts = []
-    for region in model.regions:
-        inside = fem.Basis(mesh, basis.elem, intorder=2, elements=np.flatnonzero(space.mesh.region == region))
-        lame = elasticity.lame_parameters(1.0, space.mesh.tissues[region].poisson_ratio)
-        parts.append(elasticity.linear_elasticity(*lame).assemble(inside))
-    order = _same_place(basis.doflocs, space.points)
-    parts = [sparse.csr_matrix(part[order][:, order]) for part in parts]
-    free = np.unique(constraint.free.tocoo().row)
-    wide, n = _widened(frozen, 3 * len(space.points)), mapping.n_parameters
+def superlu(matrix: Matrix) -> Solve:
+    """In its symmetric mode, without pivoting; 16 columns at once, for more of them fall out of the cache."""
+    order = nested_dissection(matrix)
+    ordered = sparse.csc_matrix(matrix[order][:, order])
+    factors = splu(ordered, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
-    def gradient() -> Array:
-        moduli = mapping.moduli(unknowns)
-        stiffness = sparse.csr_matrix(sum(e * part for e, part in zip(moduli, parts, strict=True)))
-        u = constraint.modes @ unknowns[n:] + constraint.offset
-        factors = splu(sparse.csc_matrix(stiffness[free][:, free]))
-        u[free] = -factors.solve((stiffness @ u)[free])
-        pull = wide.pull(u)
-        adjoint = np.zeros_like(u)
-        adjoint[free] = factors.solve(pull[free])
-        by_region = [-modulus * float(adjoint @ (part @ u)) for modulus, part in zip(moduli, parts, strict=True)]
-        by_mode = constraint.modes.T @ (pull - stiffness @ adjoint) + unknowns[n:]
-        return np.concatenate([mapping.selection.T @ by_region, by_mode])
+    def solve(rhs: np.ndarray) -> np.ndarray:
+        solution = np.empty_like(rhs)
+        for start in range(0, rhs.shape[1], 16):
+            columns = slice(start, start + 16)
+            solution[order, columns] = factors.solve(np.asfortranarray(rhs[order, columns]))
+        return solution
 
-    return gradient
-
-
-def _same_place(doflocs: Array, points: Array) -> NDArray[np.int64]:
-    """Number in scikit-fem of the unknown 3 p + a: it keeps the axes of one place next to each other, in order."""
-    theirs = np.round(doflocs.T, 6)
-    first = np.lexsort((np.arange(len(theirs)), *theirs.T[::-1]))
-    ours = np.lexsort(np.round(points, 6).T[::-1])
-    order = np.empty(3 * len(points), dtype=np.int64)
-    order[(3 * ours[:, None] + np.arange(3)).ravel()] = first
-    return order
-
-
-def finite_difference_lm(problem: InverseProblem, settings: InversionSettings) -> list[Array]:
-    """Levenberg-Marquardt with forward differences and the fastest direct solver, from each start.
-
-    Closest points are found anew at every evaluation; a factorisation is kept while the moduli stay as they are, which
-    spares the 90 columns of the wall's modes a factorisation each.
-    """
-    state, mapping = problem.states[0], problem.parameters
-    weighted = [observation.with_noise(SEGMENTATION_NOISE) for observation in state.observations]
-    seen = [o.rematched(np.zeros(len(o.dofs))) for o in weighted if isinstance(o, SurfaceDistance)]
-    kept: dict[bytes, LinearSystem] = {}
-
-    def residuals(unknowns: Array) -> Array:
-        moduli, coefficients = mapping.moduli(unknowns), mapping.coefficients(unknowns)[0]
-        if moduli.tobytes() not in kept:
-            kept.clear()
-            kept[moduli.tobytes()] = state.model.system(moduli)
-        values = kept[moduli.tobytes()].solve(coefficients).values
-        parts = [coefficients]
-        for observation in seen:
-            found = observation.residuals(values[observation.dofs])
-            parts.append(np.sqrt(observation.weighting.precision * found.weights) * found.values)
-        return np.concatenate(parts)
-
-    ends = []
-    for theta in settings.starts:
-        start = np.concatenate([theta, np.zeros(state.model.n_modes)])
-        found = least_squares(residuals, start, method="trf", diff_step=[1e-4], xtol=1e-3, ftol=1e-4, max_nfev=12)
-        ends.append(np.asarray(found.x[: len(theta)]))
-    return ends
+    return solve
