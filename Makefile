@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: commands install demo test acceptance quick style lint check clean pardiso benchmark-setup schemas docs lock dist dist-test minimum report-check export-check figures
+.PHONY: commands install demo test acceptance quick style lint check clean pardiso schemas docs lock dist dist-test minimum report-check export-check figures
 
 install: $(VENV)/.installed
 
@@ -17,15 +17,8 @@ $(VENV)/.installed: pyproject.toml
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile --editable ".[dev]"
 	touch $@
 
-# Intel's PARDISO alone, which benchmarks/speed.py --parts solver compares our solver with; nothing else uses it.
+# Intel's PARDISO, which benchmarks/speed.py --parts solver compares our solver with; nothing else uses it.
 pardiso: install
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "pypardiso>=0.4.6"
-
-# All peers that benchmarks/speed.py compares with. A torch for processors alone is a tenth of the size:
-# make benchmark-setup TORCH=torch==2.13.0+cpu, where the package index has one.
-TORCH ?= torch
-benchmark-setup: install
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[benchmark]"
 
 demo: install

@@ -7,13 +7,15 @@ on a pelvis in a box of 140 mm: `default`, at default settings; `signals`, cases
 `field`, with a measured displacement field beside the surfaces; `map`, with the prostate's modulus as a map of it.
 
 The others time parts: `linear` and `nonlinear` an estimate in forward solves, with 90 modes of the rectum's wall;
-`gradient` one of the frozen misfit, beside torch-fem's; `solver` direct solvers in turns; `scaling` multigrid by the
-size of the mesh. A program that is not installed gives null; `make benchmark-setup` installs them.
+`solver` direct solvers in turns, ours beside PARDISO (null where it is not installed: `make pardiso`) and SuperLU, with
+the order that METIS finds on the graph of the nodes; `scaling` multigrid by the size of the mesh.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
+import importlib.metadata
 import importlib.util
 import json
 import os
@@ -28,25 +30,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import speed_peers as peers
 from numpy.typing import NDArray
 from rows import median, said, silent
 from scipy import sparse
 from scipy.ndimage import gaussian_filter
+from scipy.sparse.linalg import splu
 
-from palpate.approximation import reduced_basis
+from multifrontal import nested_dissection
 from palpate.images import Role, segment, write_label_image
-from palpate.inversion import InverseProblem, Inversion, InversionSettings, Objective, invert
+from palpate.inversion import InverseProblem, Inversion, InversionSettings, invert
 from palpate.mechanics import SOLVERS as OURS
 from palpate.mechanics import Hints, linear_model, outer_constraint, weighted_sum
 from palpate.mesh import Constraint, LagrangeSpace, lagrange_space, located, point_interpolation, tetrahedralise
-from palpate.observation import SEGMENTATION_NOISE, prescribed_motion
-from palpate.parallel import blas_on_one_thread
+from palpate.observation import prescribed_motion
 from palpate.phantoms import Noise, PelvisOptions, Scene, pelvis, pelvis_anatomy
 from palpate.study import (
     Case,
-    Discrepancy,
-    Domain,
     Mechanics,
     MeshSettings,
     Phantom,
@@ -61,7 +60,6 @@ Result = dict[str, Any]  # of JSON
 
 LAWS = ("linear", "neo-hookean")
 STARTS = (0.5, 1.0, 2.0, 4.0, 8.0)  # moduli to the surroundings'
-IN_A_ROW = 20  # gradients, as an optimiser asks for them
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,6 @@ class Sizes:
     """Edge lengths (mm) at the organs, repetitions, the side (mm) and the settings of whole cases, a map's modes."""
 
     estimate: float = 4.5  # 130 k unknowns
-    gradient: float = 8.5  # 28 k unknowns
     solver: float = 4.5  # 122 k unknowns, 111 k of them free
     scaling: tuple[float, ...] = (9.0, 6.0, 4.0, 2.7, 1.85, 1.65)  # 30 k to 1 M unknowns
     repeats: int = 3
@@ -80,7 +77,7 @@ class Sizes:
 
 
 _COARSE = ("mesh.edge_length_mm=10",)
-QUICK = Sizes(9.0, 10.0, 10.0, (12.0, 9.0), 1, 110.0, _COARSE, _COARSE, 100)
+QUICK = Sizes(9.0, 10.0, (12.0, 9.0), 1, 110.0, _COARSE, _COARSE, 100)
 
 
 def main() -> int:
@@ -278,34 +275,17 @@ def _write_field(path: Path, scene: Scene) -> None:
 # ---- parts of an estimate --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Posed:
-    """An inverse problem of one later state, five starts, and the true moduli (n_regions,) kPa."""
-
-    problem: InverseProblem
-    settings: InversionSettings
-    moduli: NDArray[np.float64]
-
-    @property
-    def n_dofs(self) -> int:
-        """Unknowns of the displacement."""
-        return 3 * len(self.problem.states[0].model.space.points)
-
-
-def problem_of(edge_mm: float, seed: int, law: str = "linear", *, held: bool = False) -> Posed:
-    """What a simulated pelvis poses at an edge length; held: with moduli and the wall's motion alone as unknowns."""
+def problem_of(edge_mm: float, seed: int, law: str) -> tuple[InverseProblem, InversionSettings, NDArray[np.float64]]:
+    """What a simulated pelvis poses at an edge length, five starts, and the true moduli (n_regions,) kPa."""
     scene = pelvis(PelvisOptions(seed=seed, truth_edge_mm=4.0, law=law))
     mechanics = Mechanics(law, "P2" if law == "linear" else "auto")
     case = Case(f"speed-{seed}", phantom=Phantom("pelvis", seed), mesh=MeshSettings(edge_mm), mechanics=mechanics)
-    if held:
-        nothing = Discrepancy(heterogeneity_sd=0.0, poisson_sd=0.0, surface_offset_mm=0.0, layer_sd=0.0)
-        case = replace(case, domain=Domain(outer_boundary="fixed"), discrepancy=nothing)
     before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
     body = make_body(aligned(before, (after,), method="none"), case, progress=silent)
     problem = inverse_problem(body, case, progress=silent)
     starts = tuple(np.full(problem.parameters.n_parameters, np.log(start)) for start in STARTS)
     settings = replace(inversion_settings(case, problem.parameters), starts=starts)
-    return Posed(problem, settings, np.array([scene.moduli_kpa[name] for name in problem.states[0].model.names]))
+    return problem, settings, np.array([scene.moduli_kpa[name] for name in problem.states[0].model.names])
 
 
 def timed(work: Callable[[], object]) -> float:
@@ -331,23 +311,23 @@ def _nonlinear(sizes: Sizes, seed: int) -> Result:
 
 def _estimated(sizes: Sizes, seed: int, law: str) -> Result:
     """An estimate from an assembled problem to moduli with linearised intervals, beside one forward solve."""
-    posed = problem_of(sizes.estimate, seed, law)
-    model = posed.problem.states[0].model
-    model.solve(posed.moduli, np.zeros(model.n_modes))  # the solver's library is loaded
+    problem, settings, moduli = problem_of(sizes.estimate, seed, law)
+    model = problem.states[0].model
+    model.solve(moduli, np.zeros(model.n_modes))  # the solver's library is loaded
     inversions: list[Inversion] = []
 
     def estimate() -> None:
         """Once."""
-        inversions.append(invert(posed.problem, posed.settings, progress=silent))
+        inversions.append(invert(problem, settings, progress=silent))
         sandwich_covariance(inversions[-1].objective, inversions[-1].minimum.evaluation)
 
     seconds = alternating(sizes.repeats if law == "linear" else 1, {"estimate_s": estimate})
     inversion = inversions[-1]
     objective, unknowns = inversion.objective, inversion.minimum.unknowns
     forward, coefficients = objective.states[0].finite_strain or model, objective.parameters.coefficients(unknowns)[0]
-    seconds |= alternating(sizes.repeats, {"forward_solve_s": lambda: forward.solve(posed.moduli, coefficients)})
+    seconds |= alternating(sizes.repeats, {"forward_solve_s": lambda: forward.solve(moduli, coefficients)})
     return {
-        "dofs": posed.n_dofs,
+        "dofs": 3 * len(model.space.points),
         "law": law,
         **seconds,
         "estimate_over_forward": seconds["estimate_s"] / seconds["forward_solve_s"],
@@ -359,60 +339,52 @@ def _estimated(sizes: Sizes, seed: int, law: str) -> Result:
     }
 
 
-def _gradient(sizes: Sizes, seed: int) -> Result:
-    posed = problem_of(sizes.gradient, seed, held=True)
-    problem, model, mapping = posed.problem, posed.problem.states[0].model, posed.problem.parameters
-    middle = mapping.moduli(np.median(np.stack(posed.settings.starts), axis=0))
-    coefficients = 0.3 * np.random.default_rng(seed).standard_normal(model.n_modes)
-    began = time.perf_counter()
-    basis = reduced_basis(model, middle).with_modulus_series(coefficients, mapping.selection)
-    offline_s = time.perf_counter() - began
-    theta = np.log(posed.moduli[mapping.selection.argmax(axis=0)] / mapping.scale_kpa)
-    unknowns = np.concatenate([theta, coefficients])
-    objective = Objective(problem.states, mapping).under([basis])
-    objective = objective.with_observations([o.with_noise(SEGMENTATION_NOISE) for o in objective.observations])
-    objective = objective.rematched(unknowns)
-    frozen = peers.frozen_misfit(objective, unknowns)
-    ours = peers.reduced(objective, frozen, unknowns)
-    theirs = peers.torch_fem(problem, frozen, unknowns)
-    there = {} if theirs is None else {"torch_fem_gradient_s": theirs}
-    off = {name: peers.disagreement(of(), frozen, problem, unknowns) for name, of in {"ours": ours, **there}.items()}
-    objective(unknowns)
-
-    def in_a_row(gradient: Callable[[], object]) -> Callable[[], None]:
-        """Several of ours, as an estimate computes them."""
-
-        @blas_on_one_thread()
-        def work() -> None:
-            for _ in range(IN_A_ROW):
-                gradient()
-
-        return work
-
-    works = {"gradient_s": in_a_row(ours), "evaluation_s": in_a_row(lambda: objective(unknowns))}
-    seconds = alternating(sizes.repeats, works | there)
-    for name in works:
-        seconds[name] /= IN_A_ROW
-    torch = seconds.get("torch_fem_gradient_s")
-    return {
-        "gradient_dofs": posed.n_dofs,
-        "offline_s": offline_s,
-        "torch_fem_gradient_s": None,
-        **seconds,
-        "disagreement": off,
-        "gradient_ratio": None if torch is None else seconds["gradient_s"] / torch,
-        "evaluation_ratio": None if torch is None else seconds["evaluation_s"] / torch,
-    }
-
-
 # ---- solvers ---------------------------------------------------------------------------------------------------------
 
 N_RHS = 91
-SOLVERS: dict[str, Callable[[peers.Matrix], peers.Solve]] = {
+Matrix = sparse.csr_matrix
+Solve = Callable[[np.ndarray], np.ndarray]
+
+
+def _pardiso(matrix: Matrix) -> Solve:
+    """Symmetric positive definite, our order, without its own refinement, which trebles the price of a solution."""
+    files = importlib.metadata.files("mkl") or []
+    found = [path for file in files if "mkl_rt" in file.name and (path := Path(str(file.locate())).resolve()).exists()]
+    if found:  # else every factorisation searches the whole environment for MKL
+        os.environ.setdefault("PYPARDISO_MKL_RT", str(found[0]))
+    pypardiso = importlib.import_module("pypardiso")
+    upper = sparse.csr_matrix(sparse.triu(matrix, format="csr"))
+    upper.sort_indices()
+    solver = pypardiso.PyPardisoSolver(mtype=2, size_limit_storage=np.inf)
+    for number, value in {1: 1, 5: 1, 8: 0}.items():
+        solver.set_iparm(number, value)
+    solver.perm = (nested_dissection(matrix) + 1).astype(np.int32)
+    solver.factorize(upper)
+    solver.factorized_A = upper  # the wrapper would keep a copy to compare with
+    return lambda rhs: np.asarray(solver.solve(upper, np.asfortranarray(rhs)))
+
+
+def _superlu(matrix: Matrix) -> Solve:
+    """In its symmetric mode, without pivoting; 16 columns at once, for more of them fall out of the cache."""
+    order = nested_dissection(matrix)
+    ordered = sparse.csc_matrix(matrix[order][:, order])
+    factors = splu(ordered, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+    def solve(rhs: np.ndarray) -> np.ndarray:
+        solution = np.empty_like(rhs)
+        for start in range(0, rhs.shape[1], 16):
+            columns = slice(start, start + 16)
+            solution[order, columns] = factors.solve(np.asfortranarray(rhs[order, columns]))
+        return solution
+
+    return solve
+
+
+SOLVERS: dict[str, Callable[[Matrix], Solve]] = {
     "multifrontal": lambda matrix: OURS["multifrontal"].factorise(matrix, Hints()).solve,
     "multifrontal-single": lambda matrix: OURS["multifrontal-single"].factorise(matrix, Hints()).solve,
-    "pardiso": peers.pardiso,
-    "superlu": peers.superlu,
+    "pardiso": _pardiso,
+    "superlu": _superlu,
 }
 CLOCKS = ("factor", "solve", "again")
 
@@ -507,7 +479,6 @@ PARTS: dict[str, Callable[[Sizes, int], Result]] = {
     "map": _map,
     "linear": _linear,
     "nonlinear": _nonlinear,
-    "gradient": _gradient,
     "solver": _solvers,
     "scaling": _scaling,
 }
