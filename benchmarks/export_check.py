@@ -1,7 +1,7 @@
 """Our exports in other programs: CalculiX solves them, and readers of each format read them back.
 
     make export-check
-    python benchmarks/export_check.py [--edge 12] [--only calculix,gmsh,...] [--json]
+    python benchmarks/export_check.py [--edge 12] [--only calculix,meshes,...] [--json]
 
 The demo's pelvis is estimated three times: linear with P2, neo-Hookean with P2 and with the default element. A box that
 is turned in space slides along its image's own faces, under gravity, a pressure in a cavity and a traction, twice.
@@ -46,22 +46,6 @@ OFF_GRID = 1e-3  # voxels, by which a place may lie off ours
 WARP_MM = 0.05
 LPS = np.array([-1.0, -1.0, 1.0])
 LONG = ("Nodes", "Elements", "Surface", "NodeData", "ElementData")  # lists of FEBio's
-SYSTEM = "/usr/bin/python3"  # for which Debian has dolfinx
-DOLFINX = """
-import json, sys, gmsh, numpy as np
-from dolfinx.io import gmshio
-from mpi4py import MPI
-gmsh.initialize()
-gmsh.option.setNumber("General.Terminal", 0)
-gmsh.open(sys.argv[1])
-mesh, cells, faces = gmshio.model_to_mesh(gmsh.model, MPI.COMM_WORLD, 0, 3)
-names = {tag: gmsh.model.getPhysicalName(3, tag) for _, tag in gmsh.model.getPhysicalGroups(3)}
-rows = np.array([mesh.geometry.dofmap.links(cell)[:4] for cell in range(mesh.geometry.dofmap.num_nodes)])
-corner = mesh.geometry.x[rows]
-sizes = np.abs(np.linalg.det(corner[:, 1:] - corner[:, :1])) / 6.0
-volumes = {name: float(sizes[cells.find(tag)].sum()) for tag, name in names.items()}
-print(json.dumps({"nodes": len(mesh.geometry.x), "cells": len(rows), "volumes": volumes}))
-"""
 TURNED = """
 [images]
 before = "before.nii.gz"
@@ -228,42 +212,8 @@ def calculix(results: Results, folder: Path) -> Iterator[Row]:
         yield Row("CalculiX", f"{law}, {kind}: warnings", printed.count("*WARNING"), 0)
 
 
-def gmsh(results: Results, folder: Path) -> Iterator[Row]:
-    """Read, named and measured by gmsh itself."""
-    result, module = any_of(results), installed("gmsh")
-    if module is None:
-        yield Row("gmsh", "volumes, groups, displacement", None, 0)
-        return
-    (path,) = palpate.export(result, folder / "gmsh", format="gmsh")
-    module.initialize()
-    try:
-        module.option.setNumber("General.Terminal", 0)
-        module.open(str(path))
-        sizes, counts = {}, {}
-        for dimension, tag in module.model.getPhysicalGroups():
-            entities = module.model.getEntitiesForPhysicalGroup(dimension, tag)
-            found = [module.model.mesh.getElements(dimension, entity)[1] for entity in entities]
-            tags = [int(tag) for of_entity in found for tags in of_entity for tag in tags]
-            name = module.model.getPhysicalName(dimension, tag)
-            if dimension == 3:
-                sizes[name] = float(np.sum(module.model.mesh.getElementQualities(tags, "volume")))
-            elif dimension == 2:
-                counts[name] = len(tags)
-        nodes, _, _ = module.model.mesh.getNodes()
-        _, tags, values, _, _ = module.view.getModelData(module.view.getTags()[0], 1)
-        motion = np.array(values)[np.argsort(tags)]
-    finally:
-        module.finalize()
-    expected = {group.name: len(group.triangles) for group in face_groups(result.space.mesh)}
-    wrong = sum(counts.get(name) != expected.get(name) for name in {*counts, *expected})
-    yield Row("gmsh", "volume of a tissue, relative difference", worst_volume(sizes, result.space.mesh), VOLUME)
-    yield Row("gmsh", "nodes lost or gained", abs(len(nodes) - len(result.space.points)), 0)
-    yield Row("gmsh", "groups of faces with lost or gained ones", wrong, 0)
-    yield Row("gmsh", "displacement, RMS to ours", percent(motion, result.estimation.displacements[-1]), 1e-5, "%")
-
-
 def meshes(results: Results, folder: Path) -> Iterator[Row]:
-    """Counts, volumes and displacement by meshio, closed surfaces by trimesh."""
+    """Counts, groups, volumes and displacement by meshio, closed surfaces by trimesh."""
     result, meshio, trimesh = any_of(results), import_module("meshio"), installed("trimesh")
     mesh = result.space.mesh
     for name, file in (("abaqus", "palpate.inp"), ("gmsh", "palpate.msh"), ("vtu", "mesh_1.vtu")):
@@ -276,6 +226,11 @@ def meshes(results: Results, folder: Path) -> Iterator[Row]:
         if name != "abaqus":
             off = percent(read.point_data["displacement_mm"], result.estimation.displacements[-1])
             yield Row("meshio", f"{name}: displacement, RMS to ours", off, 1e-5, "%")
+        if name == "gmsh":
+            counts = {key: sum(len(ids) for ids in sets if ids is not None) for key, sets in read.cell_sets.items()}
+            groups = face_groups(mesh)
+            wrong = sum(counts.get(group.name) != len(group.triangles) for group in groups)
+            yield Row("meshio", "gmsh: groups of faces with lost or gained ones", wrong, 0)
         if name != "vtu":
             sizes = dict[str, float]()
             for tissue in (t.name for t in mesh.tissues if t.meshed):
@@ -299,20 +254,6 @@ def meshes(results: Results, folder: Path) -> Iterator[Row]:
             if rest.endswith("_before"):
                 sizes[result.tissues[int(number)].name] = float(surface.volume)
         yield Row("trimesh", what, wrong + (worst_volume(sizes, mesh) > VOLUME), 0)
-
-
-def dolfinx(results: Results, folder: Path) -> Iterator[Row]:
-    """Debian's dolfinx reads the gmsh file by gmshio."""
-    result, probe = any_of(results), [SYSTEM, "-c", "import dolfinx, gmsh"]
-    if not Path(SYSTEM).exists() or subprocess.run(probe, capture_output=True, check=False).returncode:
-        yield Row("dolfinx", "nodes, cells, volumes", None, 0)
-        return
-    (path,) = palpate.export(result, folder / "dolfinx", format="gmsh")
-    found = json.loads(ran([SYSTEM, "-c", DOLFINX, path], folder).splitlines()[-1])
-    lost = abs(found["nodes"] - len(result.space.points)) + abs(found["cells"] - len(result.space.mesh.tets))
-    yield Row("dolfinx", "nodes and cells lost or gained", lost, 0)
-    off = worst_volume(found["volumes"], result.space.mesh)
-    yield Row("dolfinx", "volume of a tissue, relative difference", off, VOLUME)
 
 
 def febio(results: Results, folder: Path) -> Iterator[Row]:
@@ -421,32 +362,13 @@ def differing(grid: VoxelGrid, expected: NDArray[Any], image: Any) -> int:
     return int(np.count_nonzero(~np.isclose(found, expected, rtol=SAME)))
 
 
-def netcdf(results: Results, folder: Path) -> Iterator[Row]:
-    """Samples by xarray: their mean and spread are those of the result."""
-    result, what = any_of(results), "posterior.nc: difference of a sample's log-mean, in standard deviations"
-    xarray = installed("xarray")
-    if xarray is None or installed("h5netcdf") is None:
-        yield Row("xarray", what, None, 0)
-        return
-    palpate.export(result, folder / "netcdf", format="netcdf")
-    samples = xarray.open_dataset(folder / "netcdf" / "posterior.nc", group="posterior", engine="h5netcdf")
-    estimates = {item.tissue: item.value or np.nan for item in result.estimation.estimates}
-    logs = np.log(samples["youngs_modulus"]).stack(sample=("chain", "draw"))
-    expected = np.log([estimates[str(name)] for name in samples["tissue"].values])
-    off = np.abs(logs.mean("sample").values - expected) / logs.std("sample").values
-    yield Row("xarray", what, float(off.max()), 0.1)
-
-
 PARTS: dict[str, Callable[[Results, Path], Iterator[Row]]] = {
     "calculix": calculix,
-    "gmsh": gmsh,
     "meshes": meshes,
-    "dolfinx": dolfinx,
     "febio": febio,
     "nifti": nifti,
     "warp": warp,
     "dicom": dicom,
-    "netcdf": netcdf,
 }
 
 if __name__ == "__main__":

@@ -140,8 +140,8 @@ def demo(place: Place) -> Values:
     found = run([*PALPATE, "demo", "--output", folder])
     document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
     table = [line for line in found.text.splitlines() if line][: 2 + len(document["estimates"])]
-    page = ["--html", place.folder / "check.html", "--json", "--quiet"]
-    predicted = json.loads(run([*PALPATE, "check", folder / "case.toml", *page]).text)["predicted"]["moduli"]
+    words = [*PALPATE, "check", str(folder / "case.toml"), "--html", str(place.folder / "check.html")]
+    predicted = json.loads(run([*words, "--json", "--quiet"]).text)["predicted"]["moduli"]
     return {
         "result": table,
         "seconds": round(found.seconds),

@@ -196,7 +196,7 @@ SEEN = {  # the rows of benchmarks/accuracy.py, in the order of the tables, and 
     "noise": "voxels of 1 x 1 x 2.5 mm, surfaces off by 0.3 mm",
     "finite-noise": "the same, neo-Hookean law",
 }
-ACCURACY = {
+ACCURACY: Columns = {
     "row": "`{name}`",
     "what the estimate sees": lambda row: SEEN[row["name"]],
     "moduli": "{moduli}",
@@ -225,7 +225,7 @@ def _accuracy_short(values: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-MISMATCH = {
+MISMATCH: Columns = {
     "scenes": "`{name}`",
     "bodies": "{bodies}",
     "RMS of ln E, prostate, bladder": lambda row: ", ".join(f"{value:.2f}" for value in row["rms"]),
@@ -254,29 +254,29 @@ ROWS = {  # of benchmarks/coverage.py, as the table names them
     "field-0.5": "the same of 0.5 mm",
     "field-0.2": "the same of 0.2 mm",
 }
-COVERAGE = {
+COVERAGE: Columns = {
     "row": "`{name}`",
     "what is wrong or measured": lambda row: ROWS[row["name"]],
     "identified, weak, not identified": lambda row: _listed(row["verdicts"]),
     "95 % intervals that hold": _held,
     "error of ln E (median)": "{error:.2f}",
 }
-SPEED = {
+SPEED: Columns = {
     "law": "{name}",
     "unknowns": lambda row: f"{row['unknowns']:,}".replace(",", " "),
     "time": "{seconds:.0f} s",
     "peak memory": "{peak_gb:.1f} GB",
     "time with frame and tissues held": "{held_seconds:.0f} s",
 }
-SOURCE = {
+SOURCE: Columns = {
     "surfaces off by": lambda row: f"{row['noise_mm']:g} mm" + ("" if row["law"] == "linear" else f", {row['law']}"),
     "later images": "{images}",
 }
-COST = {
+COST: Columns = {
     "time of one processor": "{seconds:.0f} s",
     "peak memory": "{peak_gb:.1f} GB",
 }
-PATIENTS = {
+PATIENTS: Columns = {
     **SOURCE,
     "patients": "{patients}",
     "error of ln E (RMS, median)": "{rms:.2f}, {error:.2f}",
@@ -285,7 +285,7 @@ PATIENTS = {
     "95 % intervals that hold": _held,
     **COST,
 }
-PATIENTS_SHORT = {
+PATIENTS_SHORT: Columns = {
     **SOURCE,
     "moduli with a stated interval": PATIENTS["stated moduli"],
     "of these hold": PATIENTS["95 % intervals that hold"],
@@ -300,7 +300,7 @@ def _patients_cost(values: Mapping[str, Any]) -> list[str]:
     return table_of({"rows": rows}, {"later images": SOURCE["later images"], **COST})
 
 
-COHORT = {
+COHORT: Columns = {
     "organ": "{name}",
     "patients of the lower, the higher stage": lambda row: _listed(row["patients"]),
     "with a value, with an interval alone": "{stated}, {censored}",
@@ -327,7 +327,7 @@ FAMILIES = {  # of `palpate verify`: what each is, and with what it is compared
     "E3": "coverage of the 95 % intervals in 200 repeats (90 to 98 %)",
     "E4": "gradients against central differences (adjoint identity)",
 }
-VERIFICATION = {
+VERIFICATION: Columns = {
     "problems": "{name}",
     "what (reference)": lambda row: FAMILIES[row["name"]],
     "error, %": "{n0:.2g}",

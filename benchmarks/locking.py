@@ -78,13 +78,12 @@ def reference(poisson_ratio: float, finest: int) -> tuple[Array, float]:
 
 def fitted_error(model: LinearModel, data: Array) -> float:
     """Relative error of the inclusion's modulus in the least-squares fit of ln E."""
-    found = least_squares(
-        lambda theta: (observed(model, float(np.exp(theta[0]))) - data) / np.linalg.norm(data),
-        np.log(TRUTH[1:2]),
-        diff_step=1e-3,
-        xtol=1e-5,
-        ftol=1e-10,
-    )
+
+    def residuals(theta: Array) -> Array:
+        """Of displacements, relative."""
+        return np.asarray((observed(model, float(np.exp(theta[0]))) - data) / np.linalg.norm(data))
+
+    found = least_squares(residuals, np.log(TRUTH[1:2]), diff_step=[1e-3], xtol=1e-5, ftol=1e-10)
     return float(np.exp(found.x[0]) / TRUTH[1] - 1.0)
 
 

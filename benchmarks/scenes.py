@@ -560,8 +560,8 @@ def patient_folder(patient: Patient, cache: Path) -> Path:
         return folder
     seed, law, noise_mm, stage = patient
     rng = np.random.default_rng([seed, 89])
-    sizes = {"field_mm": LARGER_MM, "truth_edge_mm": PATIENT_EDGE_MM, "spacing_mm": PATIENT_SPACING_MM}
-    options = PelvisOptions(seed, law=law, moduli_kpa=patient.moduli_kpa, **sizes)
+    options = PelvisOptions(seed, spacing_mm=PATIENT_SPACING_MM, field_mm=LARGER_MM, truth_edge_mm=PATIENT_EDGE_MM)
+    options = replace(options, law=law, moduli_kpa=patient.moduli_kpa)
     mesh = tetrahedralise(pelvis_anatomy(options), edge_length_mm=PATIENT_EDGE_MM)
     space = lagrange_space(mesh, "P2")
     motions = []
@@ -858,7 +858,7 @@ def measured_points(
         covariance = correlation(cdist(places, places), points.length_mm)
         root = np.linalg.cholesky(covariance)
         moved = moved + points.sd_mm * root @ rng.normal(size=(len(places), 3))
-    return point_term(space, places, moved, points.sd_mm, points.length_mm)
+    return point_term(space, places, np.asarray(moved), points.sd_mm, points.length_mm)
 
 
 def point_term(

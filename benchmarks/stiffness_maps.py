@@ -19,8 +19,9 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 
 import numpy as np
@@ -65,21 +66,22 @@ def main() -> int:
     for flag, value in OPTIONS.items():
         parser.add_argument(flag, type=float, default=value)
     asked = parser.parse_args()
-    given = {name: getattr(asked, name) for name in NAMES}
-    body = lru_cache(maxsize=1)(body_with_ball)  # draws of one body come one after the other
-    jobs = (
-        Job(
-            {"seed": seed, "field_sd_mm": sd, "draw": draw, **given},
-            lambda seed=seed, sd=sd, draw=draw: _estimated(
-                body(seed, asked.gland_kpa, asked.filling_mm, asked.contrast, asked.edge), asked, sd, draw
-            ),
-        )
-        for seed in seeds_of(asked)
-        for sd, draw in product(asked.field_sd_mm, range(asked.draws))
-    )
-    found = collected(jobs, asked, ("seed", "field_sd_mm", "draw", *NAMES))
+    found = collected(_jobs(asked), asked, ("seed", "field_sd_mm", "draw", *NAMES))
     printed({f"{r['seed']}, {r['field_sd_mm']:g} mm, {r['draw']}": r for r in found}, asked, COLUMNS)
     return 0
+
+
+def _jobs(asked: argparse.Namespace) -> Iterator[Job]:
+    given = {name: getattr(asked, name) for name in NAMES}
+    body = lru_cache(maxsize=1)(body_with_ball)  # draws of one body come one after the other
+
+    def row(seed: int, sd: float, draw: int) -> Result:
+        """One draw of a body."""
+        truth = body(seed, asked.gland_kpa, asked.filling_mm, asked.contrast, asked.edge)
+        return _estimated(truth, asked, sd, draw)
+
+    for key in product(seeds_of(asked), asked.field_sd_mm, range(asked.draws)):
+        yield Job(dict(zip(("seed", "field_sd_mm", "draw"), key, strict=True)) | given, partial(row, *key))
 
 
 def _drawn(truth: BodyWithBall, surface_sd_mm: float, draw: int) -> BodyWithBall:
