@@ -178,11 +178,11 @@ class _Bench:
 
     def filling_modes(self, model: LinearModel) -> Array:
         """Coefficients (n_modes,) of a model's modes that come nearest to the filling of the wall."""
-        if not model.n_modes:
-            return np.zeros(0)
-        offset = self.pelvis.filling(model.space, self.settings.filling_mm).ravel()
-        rows = np.flatnonzero(model.constraint.modes.any(axis=1))
-        return np.asarray(np.linalg.lstsq(model.constraint.modes[rows], offset[rows], rcond=None)[0])
+        found, modes = np.zeros(model.n_modes), model.constraint.modes  # material modes stay at zero
+        offset, rows = self.pelvis.filling(model.space, self.settings.filling_mm).ravel(), modes.any(axis=1)
+        if modes.shape[1]:
+            found[: modes.shape[1]] = np.linalg.lstsq(modes[rows], offset[rows], rcond=None)[0]
+        return found
 
 
 @dataclass(frozen=True)
