@@ -289,7 +289,7 @@ class Projection:
         return self._worked_on(times(self.model.constraint.free, forces))
 
     def _worked_on(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Work (m, k) of nodal forces (n_dof, k) on each basis vector, by the rows that have any where these are few."""
+        """Work (m, k) of nodal forces (n_dof, k) on each basis vector; of few rows that have any, by these alone."""
         rows = np.flatnonzero(forces.any(axis=1))
         few = 2 * len(rows) < len(forces)
         return self.reduced.components(forces[rows], rows) if few else self.reduced.components(forces)
