@@ -221,7 +221,7 @@ def said_by(argv: list[str], folder: Path) -> tuple[int, str, float]:
                 sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
                 resource.setrlimit(resource.RLIMIT_CPU, (COMMAND_SECONDS, COMMAND_SECONDS))
                 warnings.simplefilter("default")
-                vars(ESTIMATE)["inverted"] = solving_begins
+                vars(ESTIMATE)["invert_case"] = solving_begins
                 try:
                     code = palpate_command(argv)
                 except SystemExit as stop:
