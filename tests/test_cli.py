@@ -14,6 +14,7 @@ import warnings
 
 import pytest
 
+from case_texts import ORGAN, REST, case_text
 from palpate import errors
 from palpate.case.file import read_case
 from palpate.cli import main
@@ -42,18 +43,7 @@ FILES = {
     ),
 }
 
-CASE = """
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-[tissues.prostate]
-label = 1
-role = "estimate"
-[tissues.surroundings]
-label = "remaining"
-role = "known"
-youngs_modulus_kpa = 10.0
-"""
+CASE = case_text({"prostate": ORGAN, "surroundings": REST})
 
 
 @pytest.fixture

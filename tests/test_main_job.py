@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import referencing
 
+from case_texts import BALLS, case_text
 from palpate.case.file import read_case
 from palpate.case.json_schema import SCHEMAS
 from palpate.cli import main
@@ -24,43 +25,15 @@ from palpate.report.tornado import is_covered
 from scenes import VOXEL_MM, balls
 
 TRUTH_KPA = {"core": 60.0, "shell": 30.0}
-CASE = """
-id = "balls-1"
-seed = 3
-
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-
-[tissues.core]
-label = 1
-role = "estimate"
-
-[tissues.shell]
-label = 2
-role = "estimate"
-
-[tissues.frame]
-label = 3
-role = "driver"
-
-[tissues.surroundings]
-label = "remaining"
-role = "known"
-youngs_modulus_kpa = 10.0
-
-[mechanics]
-law = "linear"  # as the truth
-
-[mesh]
-edge_length_mm = 10.0
-
-[driver]
-modes = 20
-
-[estimate]
-start_ratios = [1.0, 4.0]
-"""
+CASE = case_text(
+    BALLS,
+    id="balls-1",
+    seed=3,
+    mechanics={"law": "linear"},  # as the truth
+    mesh={"edge_length_mm": 10.0},
+    driver={"modes": 20},
+    estimate={"start_ratios": [1.0, 4.0]},
+)
 FILES = {
     *(
         "result.json",

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from case_texts import ORGAN, case_text
 from palpate.cohort.cluster import outcomes
 from palpate.cohort.plan import read_mark
 from palpate.cohort.progress import status_of
@@ -26,14 +27,7 @@ from palpate.errors import ConfigurationError, ResourceError
 from palpate.progress import silent
 
 STUB = (str(Path(__file__).with_name("stub.py")),)
-TEMPLATE = """
-[tissues.prostate]
-label = 1
-role = "estimate"
-[tissues.rectum]
-label = 2
-role = "driver"
-"""
+TEMPLATE = case_text({"prostate": ORGAN, "rectum": {"label": 2, "role": "driver"}}, before=None, after=None)
 
 
 @pytest.fixture

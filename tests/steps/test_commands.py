@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import palpate
+from case_texts import ORGAN, REST, case_text
 from palpate.case.case import Estimate
 from palpate.cli import main
 from palpate.errors import ConfigurationError, InputDataError, ResourceError
@@ -21,13 +22,7 @@ from palpate.images.readers import write_label_image
 from palpate.study import run
 from palpate.study.lock import folder_lock
 
-CASE = """
-images = { before = "before.nii.gz", after = ["after.nii.gz"] }
-[tissues]
-prostate = { label = 1, role = "estimate" }
-rectum = { label = 2, role = "driver" }
-body = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }
-"""
+CASE = case_text({"prostate": ORGAN, "rectum": {"label": 2, "role": "driver"}, "body": REST})
 NAMES = {"1": "prostate", "2": "rectum", "3": "body"}
 
 

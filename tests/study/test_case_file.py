@@ -6,30 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from case_texts import ORGAN, REST, case_text
 from palpate.case.case import SOLVER_NAMES
 from palpate.case.file import read_case
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role
 from palpate.mechanics.solvers.registry import SOLVERS
 
-SMALL = """
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-
-[tissues.prostate]
-label = 1
-role = "estimate"
-
-[tissues.rectum]
-label = "rectum"
-role = "driver"
-
-[tissues.surroundings]
-label = "remaining"
-role = "known"
-youngs_modulus_kpa = 10
-"""
+SMALL = case_text({"prostate": ORGAN, "rectum": {"label": "rectum", "role": "driver"}, "surroundings": REST})
 
 
 @pytest.fixture

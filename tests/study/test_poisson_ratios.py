@@ -13,6 +13,7 @@ import pytest
 import referencing
 
 from bodies import box_cells
+from case_texts import BALLS, LINEAR, case_text
 from palpate.body.poisson_ratios import (
     PoissonRatioEstimate,
     eta_of_ratio,
@@ -37,47 +38,14 @@ from palpate.study.sensitivity import sensitivity
 from palpate.uncertainty import Covariance
 from scenes import coarse_balls
 
-CASE = """
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-
-[tissues.core]
-label = 1
-role = "estimate"
-
-[tissues.shell]
-label = 2
-role = "estimate"
-poisson_ratio = 0.4
-poisson_ratio_sd = 0.01
-
-[tissues.frame]
-label = 3
-role = "driver"
-
-[tissues.surroundings]
-label = "remaining"
-role = "known"
-youngs_modulus_kpa = 10.0
-
-[mechanics]
-law = "linear"
-element = "P1"
-
-[mesh]
-edge_length_mm = 12.0
-
-[driver]
-modes = 8
-
-[discrepancy]
-layer_sd = 0.0
-
-[estimate]
-parameters = ["youngs_modulus", "poisson_ratio"]
-start_ratios = [3.0]
-"""
+CASE = case_text(
+    BALLS | {"shell": BALLS["shell"] | {"poisson_ratio": 0.4, "poisson_ratio_sd": 0.01}},
+    mechanics=LINEAR,
+    mesh={"edge_length_mm": 12.0},
+    driver={"modes": 8},
+    discrepancy={"layer_sd": 0.0},
+    estimate={"parameters": ["youngs_modulus", "poisson_ratio"], "start_ratios": [3.0]},
+)
 BAR = """
 surfaces = [{{ name = "floor", where = "z_min" }}, {{ name = "grip", where = "z_max" }}]
 body.mesh = "bar.vtu"
