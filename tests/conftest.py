@@ -63,7 +63,7 @@ def answer(monkeypatch):
     def solve(*_args, **_options):
         raise SolvingError
 
-    monkeypatch.setattr(run, "inverted", solve)
+    monkeypatch.setattr(run, "invert_case", solve)
 
     def of(path: Path, overrides: Sequence[str] = ()) -> tuple[int, str]:
         checked = check_case(path, overrides, progress=silent)

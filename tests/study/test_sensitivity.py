@@ -24,7 +24,7 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.progress import silent
 from palpate.report.tornado import effect_text, sensitivity_page, sensitivity_table, tornado_rows
 from palpate.statement.variations import fast_variations
-from palpate.study import invert_case as inverted_module
+from palpate.study import case_inversion
 from palpate.study import sensitivity as study
 from palpate.study.case_inversion import invert_case
 from palpate.study.run import inversion_settings
@@ -57,7 +57,7 @@ def interrupted(case_file, tmp_path_factory):
 
     Of the variants two are left; that under a law without equilibrium is refused.
     """
-    folder, told, real = tmp_path_factory.mktemp("out"), [], inverted_module.invert
+    folder, told, real = tmp_path_factory.mktemp("out"), [], case_inversion.invert
     case = read_case(case_file)
     calls = []
 
@@ -79,7 +79,7 @@ def interrupted(case_file, tmp_path_factory):
     ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, "variants_of", lambda *_: iter(few))
-        patch.setattr(inverted_module, "invert", again)
+        patch.setattr(case_inversion, "invert", again)
         with pytest.raises(KeyboardInterrupt):
             palpate.sensitivity(case, output=folder)
         before = len(calls)
