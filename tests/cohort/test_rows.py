@@ -22,7 +22,7 @@ from palpate.cohort.progress import status_of
 from palpate.cohort.resolve import row_key
 from palpate.cohort.row import RowLostError, estimate_row
 from palpate.cohort.run import Options, run_cohort
-from palpate.cohort.task import Limits, Outcome, Row, Task
+from palpate.cohort.task import Limits, Row, Task
 from palpate.errors import ConfigurationError, ResourceError
 from palpate.progress import silent
 
@@ -291,8 +291,3 @@ def test_no_scheduler_is_an_error_of_resources(rows_that, tmp_path):
     with pytest.raises(ResourceError, match="no Dask scheduler answers at nowhere"):
         list(outcomes([task], scheduler="nowhere://here", workers=1))
     assert list(outcomes([], scheduler="nowhere://here", workers=1)) == []
-
-
-def test_an_outcome_is_plain():
-    outcome = Outcome("a", "done", seconds=1.0)
-    assert Outcome(**json.loads(json.dumps(outcome.to_dict()))) == outcome
