@@ -15,16 +15,13 @@ from palpate.cli import main
 from palpate.errors import ResourceError
 from palpate.images.readers import write_label_image
 from palpate.mechanics.solvers import registry
+from palpate.progress import silent
 from palpate.study import check
 from palpate.study.check import check_case
 from palpate.study.run import estimate
 from scenes import coarse_balls
 
 FRAMED = {"core": ORGAN, "frame": BALLS["frame"], "rest": REST}
-
-
-def silent(_: str) -> None:
-    """Nobody listens."""
 
 
 def test_every_problem_is_listed_and_the_first_is_what_an_estimate_ends_with(tmp_path, without):
