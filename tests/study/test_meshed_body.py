@@ -13,7 +13,7 @@ import pytest
 
 import palpate
 from bodies import BAR_MM, HEAD, box_cells, write_bar
-from mesh_writers import abaqus, block, gmsh_2, gmsh_4
+from mesh_writers import abaqus, block, gmsh_2, gmsh_4, numbered
 from palpate.body.body import inverse_problem, make_body
 from palpate.body.cost import expected_cost
 from palpate.body.loads import case_loads
@@ -553,6 +553,20 @@ def test_pieces_that_share_no_face_are_named(grouped):
         "2 pieces that share no face, so no stress passes between them; the smallest has 1 tetrahedra near"
         in finding.message
     )
+
+
+def test_cell_data_of_another_name_is_told(grouped):
+    def parts(path, of):
+        numbered(path, of)
+        mesh = meshio.read(path)
+        mesh.cell_data["PartId"] = mesh.cell_data.pop("tissue")
+        meshio.write(path, mesh)
+
+    text = GROUPS.replace('"SOFT"', "1").replace('"GRIP"', '"13"').replace('"TOP"', '"12"')
+    with pytest.raises(ConfigurationError, match=r"no group 2; .*tissue_data may name one, are \['PartId'\]"):
+        read_states(grouped(text, write=parts, name="m.vtu"))
+    told = text.replace('mesh = "m.msh"', 'mesh = "m.msh"\ntissue_data = "PartId"')
+    assert read_states(grouped(told, write=parts, name="m.vtu")).mesh.volumes.sum() == pytest.approx(12e3)
 
 
 def test_a_plane_is_no_name_for_an_end_that_leans():
