@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import referencing
 
-from bodies import BAR_MM, write_bar
+from bodies import BAR_MM, with_first_pair, write_bar
 from case_texts import BALLS, LINEAR, case_text
 from palpate.body.poisson_ratios import (
     PoissonRatioEstimate,
@@ -90,7 +90,7 @@ def with_ratio(case_result):
     every = Covariance(noise, *np.zeros((3, *noise.shape)), noise)
     estimation = replace(estimation, poisson_ratios=(found,), covariance=every.of_first(2), with_ratios=every)
     space = with_ratios(case_result.space, estimation.found_ratios)
-    return replace(case_result, case=seeking(case_result.case), estimation=estimation, space=space)
+    return with_first_pair(replace(case_result, case=seeking(case_result.case), estimation=estimation), space=space)
 
 
 def test_the_result_states_moduli_then_ratios_with_their_verdict(outputs):
