@@ -355,6 +355,17 @@ def toys():
 
 
 @pytest.fixture(scope="session")
+def meshes():
+    """The module `structured_meshes` of the mechanics' tests."""
+    return loaded("structured_meshes", TESTS / "mechanics" / "structured_meshes.py")
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20240511)
+
+
+@pytest.fixture(scope="session")
 def point_motion():
     """The module `point_motion` of the observations' tests: a second kind of observation."""
     return loaded("point_motion", TESTS / "observation" / "point_motion.py")

@@ -11,6 +11,7 @@ import pytest
 import referencing
 
 import palpate
+from case_texts import LINEAR, ORGAN, REST, case_text
 from palpate.body.body import joint_problem, make_body
 from palpate.body.read import read_states
 from palpate.case.file import read_case
@@ -29,45 +30,15 @@ from palpate.study.case_inversion import invert_case
 from palpate.study.run import inversion_settings
 from palpate.unknowns import Choice
 
-CASE = """
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-
-[tissues."gland <b>"]
-label = 1
-role = "estimate"
-
-[tissues.tube]
-label = 3
-role = "driver"
-
-[tissues.rest]
-label = [2, 4]
-role = "known"
-youngs_modulus_kpa = 10.0
-
-[mechanics]
-law = "linear"
-element = "P1"
-
-[mesh]
-edge_length_mm = 7.0
-
-[driver]
-modes = 8
-
-[domain]
-outer_boundary = "fixed"
-
-[discrepancy]
-heterogeneity_sd = 0.0
-poisson_sd = 0.0
-surface_offset_mm = 0.0
-
-[estimate]
-start_ratios = [3.0]
-"""
+CASE = case_text(
+    {"gland <b>": ORGAN, "tube": {"label": 3, "role": "driver"}, "rest": REST | {"label": [2, 4]}},
+    mechanics=LINEAR,
+    mesh={"edge_length_mm": 7.0},
+    driver={"modes": 8},
+    domain={"outer_boundary": "fixed"},
+    discrepancy={"heterogeneity_sd": 0.0, "poisson_sd": 0.0, "surface_offset_mm": 0.0},
+    estimate={"start_ratios": [3.0]},
+)
 GLAND = "gland <b>"
 
 
