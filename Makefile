@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: commands install demo test acceptance quick style lint check clean pardiso benchmark-setup schemas docs lock dist dist-test minimum report-check export-check figures
+.PHONY: commands install demo test acceptance quick style lint check clean pardiso schemas docs lock dist dist-test minimum report-check export-check figures
 
 install: $(VENV)/.installed
 
@@ -17,15 +17,8 @@ $(VENV)/.installed: pyproject.toml
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile --editable ".[dev]"
 	touch $@
 
-# Intel's PARDISO alone, which benchmarks/speed.py --parts solver compares our solver with; nothing else uses it.
+# Intel's PARDISO, which benchmarks/speed.py --parts solver compares our solver with; nothing else uses it.
 pardiso: install
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "pypardiso>=0.4.6"
-
-# All peers that benchmarks/speed.py compares with. A torch for processors alone is a tenth of the size:
-# make benchmark-setup TORCH=torch==2.13.0+cpu, where the package index has one.
-TORCH ?= torch
-benchmark-setup: install
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[benchmark]"
 
 demo: install
@@ -132,13 +125,13 @@ commands: install
 	  echo "$$form"; OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/$$form \
 	    > build/commands/last.log 2>&1 < /dev/null || { tail -5 build/commands/last.log; exit 1; }; done
 
-# What other programs make of our exports. Those of Debian are installed where that may be done, and named elsewhere.
-RECEIVERS := calculix-ccx gmsh python3-dolfinx python3-gmsh
+# What other programs make of our exports. Debian's CalculiX is installed where that may be done, and named elsewhere.
+RECEIVERS := calculix-ccx
 export-check: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[export-check]"
 	dpkg -s $(RECEIVERS) > /dev/null 2>&1 || { [ "$$(id -u)" = 0 ] && command -v apt-get > /dev/null && \
 	  apt-get update -qq && apt-get install -qq --yes --no-install-recommends $(RECEIVERS) > /dev/null; } || \
-	  echo "not all of $(RECEIVERS) are installed: lines of what is missing will have no figure"
+	  echo "$(RECEIVERS) is not installed: its lines will have no figure"
 	$(BIN)/python -m pytest tests/export/test_notebook.py
 	$(BIN)/python benchmarks/export_check.py
 

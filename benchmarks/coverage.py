@@ -3,37 +3,33 @@
     python benchmarks/coverage.py [--rows gauss-0.3,bumps,...] [--bodies N] [--draws N] [--first-seed S] [--edge MM]
                                   [--output FILE] [--minutes N] [--json]
 
-Simulated data. A row (coverage_scenes.py) is a kind of body, of errors of its drawn surfaces, and of further
-measurements. Each body is estimated once from the exact surfaces of a finer mesh, with all unknowns of the defaults:
-frame, layers, patchy tissues, Poisson's ratios, offsets. Each draw then moves the surfaces of both images. It is
-estimated on that estimate's approximation of the model, which is updated on the way. Noise, weights, closest points and
-the priors of frame, walls and tissues are found anew; the model's first responses and two of three starts are not
-computed again. The search ends within a fifth of a standard deviation. Intervals are those of the program, without the
-position of voxels, because the surfaces have none. Each body and row is a line of JSON in FILE, written as soon as it
-is done; another run with the same file adds to it.
+Simulated data. A row is a kind of body, of errors of its drawn surfaces, and of further measurements (scenes.py). Each
+body is estimated once from the exact surfaces of a finer mesh, with all unknowns of the defaults: frame, layers, patchy
+tissues, Poisson's ratios, offsets. Each draw then moves the surfaces of both images. It is estimated on that estimate's
+approximation of the model, which is updated on the way. Noise, weights, closest points and the priors of frame, walls
+and tissues are found anew; the model's first responses and two of three starts are not computed again. The search ends
+within a fifth of a standard deviation. Intervals are those of the program, without the position of voxels, because the
+surfaces have none.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from functools import partial
 
 import numpy as np
 from accuracy import true_ratios
-from coverage_scenes import NOISES, POINTS, ROWS, TRUTHS, Row, measured_points, skins_of
 from cramer_rao import fisher_information
 from numpy.typing import NDArray
+from rows import Job, Result, collected, holds, mean, median, parser_of, printed, seeds_of, silent
 from scipy import stats
 
 from palpate.body import aligned, inverse_problem, make_body
 from palpate.case import Case, Mechanics, MeshSettings, Phantom
-from palpate.errors import EstimationError, PalpateError
+from palpate.errors import EstimationError
 from palpate.images import segment
 from palpate.inversion import InverseProblem, Inversion, InversionSettings, StopRule, invert
 from palpate.mesh import LagrangeSpace
@@ -41,12 +37,12 @@ from palpate.observation import NoiseModel, Observation, ObservedSurface, Surfac
 from palpate.phantoms import Scene
 from palpate.statement import as_stated, estimates_of, intervals_of
 from palpate.study import inversion_settings
-from palpate.uncertainty import covariance_of, gain, noise_covariance
+from palpate.uncertainty import NORMAL_95, covariance_of, gain, noise_covariance
 from palpate.unknowns import Choice
 from palpate_validation.truth import target_of_truth
+from scenes import NOISES, POINTS, TRUTHS, measured_points, skins_of
 
 Array = NDArray[np.float64]
-Result = dict[str, Any]  # a line of JSON
 BodyKey = tuple[str, bool, str, str]  # truth, whether points are measured, the estimate's law and the truth's
 
 OUT = 2.0  # half-widths
@@ -54,7 +50,48 @@ NEARLY = StopRule(step_sd=0.2)  # the stop rule moves an estimate much less than
 CLEAN = NoiseModel(np.array([2.0 * 0.05**2]), np.array([3.0]))  # of the clean estimate: smaller than any row's
 MOST_TELLING = "field-0.2"  # by whose clean estimate all points are followed: it sees what the others see
 NO_GRID = 3  # draws of a voxel grid, in which nothing is off
-HALF = 1.959964
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is drawn: a key of TRUTHS, of NOISES and of POINTS ("": none), the truth's law and the estimate's.
+
+    noise: of a residual, where a Cramer-Rao limit is computed, too.
+    """
+
+    name: str
+    truth: str
+    noise: str
+    points: str = ""
+    law: str = "linear"
+    truth_law: str = "linear"
+    limit: NoiseModel | None = None
+
+
+def _normal(sd_mm: float) -> NoiseModel:
+    return NoiseModel(np.array([2.0 * sd_mm**2]), np.array([6.0]))
+
+
+ROWS = {
+    row.name: row
+    for row in (
+        Row("gauss-0.1", "pelvis", "gauss-0.1", limit=_normal(0.1)),
+        Row("gauss-0.2", "pelvis", "gauss-0.2", limit=_normal(0.2)),
+        Row("matern", "pelvis", "matern"),
+        Row("bumps", "pelvis", "bumps"),
+        Row("uneven", "pelvis", "uneven"),
+        Row("resegmented", "pelvis", "resegmented"),
+        Row("shrunk", "pelvis", "shrunk"),
+        Row("patchy", "patchy", "gauss-0.1"),
+        Row("moving", "moving", "gauss-0.1", limit=_normal(0.1)),
+        Row("balls", "balls", "gauss-0.1"),
+        Row("liver", "liver", "gauss-0.1"),
+        Row("other-law", "small", "gauss-0.1", truth_law="neo-hookean"),
+        Row("finite", "pelvis", "gauss-0.1", law="neo-hookean", truth_law="neo-hookean"),
+        Row("surfaces", "moving", "gauss-0.3", limit=_normal(0.3)),
+        *(Row(name, "moving", "gauss-0.3", points=name, limit=_normal(0.3)) for name in POINTS),
+    )
+}
 
 
 @dataclass(frozen=True)
@@ -75,41 +112,24 @@ class Body:
 
 def main() -> int:
     """Run what was asked for and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__ or "", output="coverage.jsonl", first_seed=501, seeds=3)
     parser.add_argument("--rows", default=",".join(ROWS), help=f"of {', '.join(ROWS)}")
-    parser.add_argument("--bodies", type=int, default=3)
     parser.add_argument("--draws", type=int, default=8)
-    parser.add_argument("--first-seed", type=int, default=501)
     parser.add_argument("--edge", type=float, default=10.0, help="edge length (mm) of the estimate's mesh")
-    parser.add_argument("--minutes", type=float, default=np.inf, help="after which no other body is begun")
-    parser.add_argument("--output", type=Path, default=Path("coverage.jsonl"))
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
     asked = parser.parse_args()
-    began, results = time.monotonic(), _read(asked.output)
-    done = {(result["row"], result["seed"]) for result in results}
-    for seed in range(asked.first_seed, asked.first_seed + asked.bodies):
-        scenes = dict[tuple[str, str], Scene]()
-        bodies = dict[BodyKey, Body]()
-        for name in asked.rows.split(","):
-            if (name, seed) in done or time.monotonic() - began > 60.0 * asked.minutes:
-                continue
-            try:
-                results.append(_result(ROWS[name], seed, asked.draws, asked.edge, scenes, bodies))
-            except PalpateError as error:  # of a body that cannot be made; the next one can
-                print(f"{name} {seed}: {error}", file=sys.stderr, flush=True)
-                continue
-            with asked.output.open("a") as file:
-                file.write(json.dumps(results[-1]) + "\n")
-            print(f"{name} {seed}: {json.dumps(summary([results[-1]]))}", file=sys.stderr, flush=True)
+    results = collected(_jobs(asked), asked, ("row", "seed"), lambda r: f"{r['row']} {r['seed']}: {summary([r])}")
     names = [name for name in ROWS if any(result["row"] == name for result in results)]
     table = {name: summary([result for result in results if result["row"] == name]) for name in names}
-    table["all"] = summary(results)
-    print(json.dumps({"simulated": True, "rows": table}, indent=1) if asked.json else _table(table))
+    printed(table | {"all": summary(results)}, asked, COLUMNS)
     return 0
 
 
-def _read(path: Path) -> list[Result]:
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+def _jobs(asked: argparse.Namespace) -> Iterator[Job]:
+    """Body after body: rows of one seed share scenes and bodies where they can."""
+    for seed in seeds_of(asked):
+        shared = dict[tuple[str, str], Scene](), dict[BodyKey, Body]()
+        for name in asked.rows.split(","):
+            yield Job({"row": name, "seed": seed}, partial(_result, ROWS[name], seed, asked.draws, asked.edge, *shared))
 
 
 def _result(
@@ -132,8 +152,6 @@ def _result(
     began = time.perf_counter()
     found = [_drawn(body, row, draw) for draw in range(draws)]
     return {
-        "row": row.name,
-        "seed": seed,
         "clean_error": body.clean.tolist(),
         "body_seconds": round(spent, 1),
         "draw_seconds": round((time.perf_counter() - began) / max(draws, 1), 1),
@@ -145,8 +163,8 @@ def _body(scene: Scene, row: Row, edge_mm: float) -> Body:
     """One whole estimate from what the truth shows without errors."""
     case = Case("coverage", phantom=Phantom("pelvis"), mesh=MeshSettings(edge_mm), mechanics=Mechanics(row.law, "auto"))
     before, after = (segment(image, scene.tissues) for image in (scene.before, scene.after))
-    meshed = make_body(aligned(before, (after,), method="none"), case, progress=_silent)
-    problem = inverse_problem(meshed, case, progress=_silent)
+    meshed = make_body(aligned(before, (after,), method="none"), case, progress=silent)
+    problem = inverse_problem(meshed, case, progress=silent)
     seen = problem.states[0].observations
     surfaces = tuple(o.target.surface for o in seen if isinstance(o, SurfaceDistance))
     exact = [surface_distance(target_of_truth(scene.space, scene.displacement, surface)) for surface in surfaces]
@@ -154,7 +172,7 @@ def _body(scene: Scene, row: Row, edge_mm: float) -> Body:
     points = [measured_points(scene, meshed.space, POINTS[MOST_TELLING], None)] if row.points else []
     state = problem.states[0].with_observations([*exact, *points])
     settings = inversion_settings(case, problem.parameters)
-    linear = invert(InverseProblem((state,), problem.parameters).linear(), settings, progress=_silent, rule=NEARLY)
+    linear = invert(InverseProblem((state,), problem.parameters).linear(), settings, progress=silent, rule=NEARLY)
     theta, n = linear.minimum.unknowns[: problem.parameters.n_parameters], problem.parameters.n_parameters
     known = linear.objective.states[0]
     if state.finite_strain is not None:
@@ -173,10 +191,6 @@ def _body(scene: Scene, row: Row, edge_mm: float) -> Body:
     )
 
 
-def _silent(message: str) -> None:
-    del message
-
-
 def _drawn(body: Body, row: Row, draw: int) -> Result:
     """What one draw leads to; an estimate that fails says so, and counts as not converged."""
     rng = np.random.default_rng([body.scene.seed, draw, *row.name.encode()])
@@ -184,7 +198,7 @@ def _drawn(body: Body, row: Row, draw: int) -> Result:
     assert state.approximation is not None
     problem = replace(body.problem, states=(state.with_approximation(state.approximation),))
     try:
-        inversion = invert(problem, body.settings, progress=_silent, rule=NEARLY)
+        inversion = invert(problem, body.settings, progress=silent, rule=NEARLY)
     except EstimationError as error:
         return {"converged": False, "failure": str(error), "moduli": []}
     converged = inversion.minimum.converged
@@ -289,42 +303,43 @@ def summary(results: Sequence[Result]) -> Result:
     draws = [draw for result in results for draw in result["draws"]]
     moduli = [modulus for draw in draws for modulus in draw["moduli"]]
     stated = [modulus for modulus in moduli if modulus["verdict"] != "not identified"]
-    held = sum(_holds(modulus["interval"]) for modulus in stated)
-    given = [modulus for modulus in stated if modulus["given_model"] is not None]
-    interval = stats.binomtest(held, len(stated)).proportion_ci() if stated else None
+    held = sum(holds(modulus["interval"]) for modulus in stated)
+    given = [holds(modulus["given_model"]) for modulus in stated if modulus["given_model"] is not None]
+    bounds = stats.binomtest(held, len(stated)).proportion_ci() if stated else None
     verdicts = [modulus["verdict"] for modulus in moduli]
     out = [modulus for modulus in stated if _half_widths(modulus) > OUT]
+
+    def over(name: str, of: str) -> float | None:
+        """Median of the ratio of two entries, of the moduli that have both."""
+        return median([modulus[name] / modulus[of] for modulus in moduli if of in modulus])
+
     return {
         "bodies": len(results),
         "draws": len(draws),
         "not_converged": sum(not draw["converged"] for draw in draws),
         "moduli": len(moduli),
         "stated": len(stated),
+        "held": held,
+        "given_model": sum(given),
         "holds": held / len(stated) if stated else None,
-        "holds_interval": [float(interval.low), float(interval.high)] if interval else None,
-        "holds_given_model": float(np.mean([_holds(m["given_model"]) for m in given])) if given else None,
-        "holds_without_layers": float(np.mean([_holds(modulus["own"]) for modulus in moduli])) if moduli else None,
-        "holds_all": float(np.mean([_holds(modulus["interval"]) for modulus in moduli])) if moduli else None,
+        "holds_interval": [float(bounds.low), float(bounds.high)] if bounds else None,
+        "holds_given_model": mean(given),
+        "holds_without_layers": mean([holds(modulus["own"]) for modulus in moduli]),
+        "holds_all": mean([holds(modulus["interval"]) for modulus in moduli]),
         "verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))},
         "out": len(out),
         "out_identified": sum(modulus["verdict"] == "identified" for modulus in out),
-        "median_error": _median([abs(m["error"]) for m in moduli]),
-        "mean_error_over_sd": float(np.mean([m["error"] / m["sd"] for m in moduli])) if moduli else None,
-        "sd": _median([m["sd"] for m in moduli]),
-        "sd_over_spread": _median(_over_spread(results)),
-        "true_noise_over_limit": _median([m["sd_true_noise"] / m["limit"] for m in moduli if "limit" in m]),
-        "sd_over_limit": _median([m["sd"] / m["limit"] for m in moduli if "limit" in m]),
-        "sd_over_widest": _median([m["sd"] / m["limit_widest"] for m in moduli if "limit_widest" in m]),
-        "width_over_limit": _median([_width(m) / m["limit_layers"] for m in moduli if "limit_layers" in m]),
-        "draw_seconds": float(np.mean([result["draw_seconds"] for result in results])),
-        "body_seconds": float(np.mean([result["body_seconds"] for result in results])),
+        "median_error": median([abs(m["error"]) for m in moduli]),
+        "mean_error_over_sd": mean([m["error"] / m["sd"] for m in moduli]),
+        "sd": median([m["sd"] for m in moduli]),
+        "sd_over_spread": median(_over_spread(results)),
+        "true_noise_over_limit": over("sd_true_noise", "limit"),
+        "sd_over_limit": over("sd", "limit"),
+        "sd_over_widest": over("sd", "limit_widest"),
+        "width_over_limit": median([_width(m) / m["limit_layers"] for m in moduli if "limit_layers" in m]),
+        "draw_seconds": mean([result["draw_seconds"] for result in results]),
+        "body_seconds": mean([result["body_seconds"] for result in results]),
     }
-
-
-def _holds(interval: list[float | None]) -> bool:
-    """Whether an interval less the truth holds it; an open end does."""
-    low, high = interval
-    return (low is None or low <= 0.0) and (high is None or high >= 0.0)
 
 
 def _half_widths(modulus: Result) -> float:
@@ -334,9 +349,9 @@ def _half_widths(modulus: Result) -> float:
 
 
 def _width(modulus: Result) -> float:
-    """Width of the interval in standard deviations' worth, over 2 x 1.96; infinite where an end is open."""
+    """Width of the interval in standard deviations' worth; infinite where an end is open."""
     low, high = modulus["interval"]
-    return np.inf if low is None or high is None else float((high - low) / (2.0 * HALF))
+    return np.inf if low is None or high is None else float((high - low) / (2.0 * NORMAL_95))
 
 
 def _over_spread(results: Sequence[Result]) -> list[float]:
@@ -350,39 +365,22 @@ def _over_spread(results: Sequence[Result]) -> list[float]:
     return found
 
 
-def _median(values: Sequence[float]) -> float | None:
-    middle = float(np.median(values)) if len(values) else np.inf
-    return middle if np.isfinite(middle) else None
-
-
-def _table(rows: dict[str, Result]) -> str:
-    """The rows as they stand in the docs."""
-    head = "row | bodies, moduli | stated | of these hold | given the model | of all moduli, without layers"
-    head += " | identified, weak, not | out (identified)"
-    head += " | median ln-error | sd | sd, that by the widest priors, width over the limit"
-    lines = [f"| {head} |", "|" + "---|" * 11]
-    for name, row in rows.items():
-        low, high = row["holds_interval"] or (np.nan, np.nan)
-        verdicts = [row["verdicts"].get(word, 0) for word in ("identified", "weak", "not identified")]
-        held = f"{_percent(row['holds'])} ({100 * low:.0f}-{100 * high:.0f})" if row["stated"] else "-"
-        cells = [f"`{name}`", f"{row['bodies']}, {row['moduli']}", str(row["stated"]), held]
-        cells += [_percent(row["holds_given_model"])]
-        cells += [f"{_percent(row['holds_all'])}, {_percent(row['holds_without_layers'])}"]
-        cells += [", ".join(map(str, verdicts)), f"{row['out']} ({row['out_identified']})"]
-        cells += [_number(row["median_error"]), _number(row["sd"])]
-        over = ", ".join(_number(row[key]) for key in ("sd_over_limit", "sd_over_widest", "width_over_limit"))
-        cells.append(over if row["sd_over_limit"] is not None else "-")
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.0f} %"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
-
+COLUMNS = {
+    "bodies, moduli": lambda row: f"{row['bodies']}, {row['moduli']}",
+    "stated": lambda row: str(row["stated"]),
+    "of these hold": lambda row: (
+        f"{row['holds']:.0%} ({row['holds_interval'][0]:.0%} to {row['holds_interval'][1]:.0%})"
+    ),
+    "given the model": lambda row: f"{row['holds_given_model']:.0%}",
+    "of all moduli, without layers": lambda row: f"{row['holds_all']:.0%}, {row['holds_without_layers']:.0%}",
+    "verdicts": lambda row: ", ".join(f"{n} {verdict}" for verdict, n in row["verdicts"].items()),
+    "out (identified)": lambda row: f"{row['out']} ({row['out_identified']})",
+    "error": lambda row: f"{row['median_error']:.2f}",
+    "sd over spread": lambda row: f"{row['sd_over_spread']:.2f}",
+    "over limit": lambda row: f"{row['sd_over_limit']:.2f}",
+    "width over limit": lambda row: f"{row['width_over_limit']:.2f}",
+    "seconds": lambda row: f"{row['body_seconds']:.0f}, {row['draw_seconds']:.0f}",
+}
 
 if __name__ == "__main__":
     raise SystemExit(main())

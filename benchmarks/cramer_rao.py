@@ -29,7 +29,7 @@ def cramer_rao(evaluation: Evaluation, noise: NoiseModel, n_parameters: int, *, 
 
     `cell_mm`: the noise's correlation length. Within it a smooth model leaves next to no noise, so that single
     faces would tell moduli from the differences of neighbours, which are rounding that no such model describes: a limit
-    that its own weights miss by far (benchmarks/noise_limit.py).
+    that its own weights miss by far.
     """
     inverse = np.linalg.inv(fisher_information(evaluation, noise, cell_mm=cell_mm) + evaluation.prior.dense)
     return np.asarray(inverse[:n_parameters, :n_parameters])

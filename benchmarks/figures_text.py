@@ -11,12 +11,14 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 __all__ = ["FILE", "ROOT", "Figures", "complaints", "pages", "read_figures", "rewritten"]
 
+Values = dict[str, Any]
 Figures = Mapping[str, Mapping[str, Any]]  # part -> command, commit, machine, minutes, values
 
 ROOT = Path(__file__).parents[1]
@@ -24,18 +26,6 @@ FILE = ROOT / "docs" / "figures.json"
 MARK = re.compile(r"<!--([a-z]+\.[\w.-]+?)(?::([\w.+%]+))?-->(.*?)<!--/-->", re.DOTALL)
 ABOUT = ("commit", "command", "minutes", "machine")
 TABLED = ("rows.", "laws.", "families.", "commit")  # what a view shows of its branch
-SEEN = {  # the rows of benchmarks/accuracy.py, in the order of the tables, and what an estimate sees there
-    "same-mesh": "surfaces of the mesh that inverts them (tests the optimiser only)",
-    "other-mesh": "exact surfaces of a finer mesh",
-    "clean": "voxels of 1 mm, a rectum that fills by 6 to 8 mm",
-    "finite-clean": "the same, neo-Hookean law",
-    "clean-3mm": "voxels of 1 mm, a rectum that fills by 3 mm",
-    "finite-clean-3mm": "the same, neo-Hookean law",
-    "tumour": "voxels of 1 mm, 6 to 8 mm of filling, a tumour in the prostate",
-    "nu-0.49": "voxels of 1 mm, 6 to 8 mm of filling, a Poisson's ratio of 0.49",
-    "noise": "voxels of 1 x 1 x 2.5 mm, surfaces off by 0.3 mm",
-    "finite-noise": "the same, neo-Hookean law",
-}
 
 
 class View(NamedTuple):
@@ -142,8 +132,34 @@ def _source(part: Mapping[str, Any], values: Mapping[str, Any]) -> str:
     return f"`{part['command']}`: commit {values.get('commit', part['commit'])}{took}."
 
 
-def _number(value: float | None, digits: int = 2) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
+Columns = Mapping[str, str | Callable[[Any], str]]  # heading -> a format of a row's figures, or what writes them
+MAY_LACK = ("Cramer-Rao limit", "half-width (median)")  # columns that are left out where they are empty
+
+
+def table_of(
+    values: Mapping[str, Any], columns: Columns, branch: str = "rows", order: Iterable[str] | None = None
+) -> list[str]:
+    """A table of a branch of figures, a line a row; a cell whose figure is None is empty, and so may be a column."""
+    rows = [_named(name, values[branch][name]) for name in order or values[branch]]
+    cells = {head: [_cell(of, row) for row in rows] for head, of in columns.items()}
+    shown = {head: column for head, column in cells.items() if any(column) or head not in MAY_LACK}
+    return [_line(shown), _line(["---"] * len(shown)), *map(_line, zip(*shown.values(), strict=True))]
+
+
+def _named(name: str, row: Any) -> Values:
+    """The figures of a row with its name; those of a list by their numbers."""
+    return {"name": name} | (row if isinstance(row, dict) else {f"n{k}": value for k, value in enumerate(row)})
+
+
+def _cell(of: str | Callable[[Any], str], row: Values) -> str:
+    try:
+        return of.format_map(row) if isinstance(of, str) else of(row)
+    except TypeError:  # of a figure that is None
+        return ""
+
+
+def _line(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |".replace("|  |", "| |").replace("|  |", "| |")
 
 
 def _with_error(row: Mapping[str, Any]) -> str:
@@ -156,17 +172,38 @@ def _held(row: Mapping[str, Any]) -> str:
     return f"{row['held']} of {row['stated']}" if row["stated"] else ""
 
 
-def _accuracy(values: Mapping[str, Any]) -> list[str]:
-    """The rows of benchmarks/accuracy.py."""
-    rows, limits = values["rows"], any(row["limit"] for row in values["rows"].values())
-    head = ["row", "what the estimate sees", "moduli", "RMS of ln E", "95 % intervals that hold"]
-    head += ["Cramer-Rao limit"] * limits
-    lines = [_cells(head), _cells(["---"] * len(head))]
-    for name, words in SEEN.items():
-        row = rows[name]
-        cells = [f"`{name}`", words, str(row["moduli"]), _with_error(row), _held(row)]
-        lines.append(_cells(cells + [_number(row["limit"])] * limits))
-    return lines
+def _ends(interval: Sequence[float | None]) -> str:
+    """An interval of which an end may be open."""
+    low, high = interval
+    if low is None or high is None:
+        return "open" if low is high else f"below {high:.2f}" if low is None else f"above {low:.2f}"
+    return f"{low:.2f} to {high:.2f}"
+
+
+def _listed(values: Iterable[Any]) -> str:
+    return ", ".join(map(str, values))
+
+
+SEEN = {  # the rows of benchmarks/accuracy.py, in the order of the tables, and what an estimate sees there
+    "same-mesh": "surfaces of the mesh that inverts them (tests the optimiser only)",
+    "other-mesh": "exact surfaces of a finer mesh",
+    "clean": "voxels of 1 mm, a rectum that fills by 6 to 8 mm",
+    "finite-clean": "the same, neo-Hookean law",
+    "clean-3mm": "voxels of 1 mm, a rectum that fills by 3 mm",
+    "finite-clean-3mm": "the same, neo-Hookean law",
+    "tumour": "voxels of 1 mm, 6 to 8 mm of filling, a tumour in the prostate",
+    "nu-0.49": "voxels of 1 mm, 6 to 8 mm of filling, a Poisson's ratio of 0.49",
+    "noise": "voxels of 1 x 1 x 2.5 mm, surfaces off by 0.3 mm",
+    "finite-noise": "the same, neo-Hookean law",
+}
+ACCURACY: Columns = {
+    "row": "`{name}`",
+    "what the estimate sees": lambda row: SEEN[row["name"]],
+    "moduli": "{moduli}",
+    "RMS of ln E": _with_error,
+    "95 % intervals that hold": _held,
+    "Cramer-Rao limit": "{limit:.2f}",
+}
 
 
 def _accuracy_short(values: Mapping[str, Any]) -> list[str]:
@@ -182,25 +219,21 @@ def _accuracy_short(values: Mapping[str, Any]) -> list[str]:
         return error + (f", {_held(row)}" if row["stated"] else "")
 
     laws = {"other-mesh": "", "clean": "finite-clean", "clean-3mm": "finite-clean-3mm", "tumour": ""}
-    lines = [_cells(["the estimate sees", "linear law", "neo-Hookean law"]), _cells(["---"] * 3)]
+    lines = [_line(["the estimate sees", "linear law", "neo-Hookean law"]), _line(["---"] * 3)]
     for linear, finite in (laws | {"noise": "finite-noise"}).items():
-        lines.append(_cells([SEEN[linear], cell(linear), cell(finite)]))
+        lines.append(_line([SEEN[linear], cell(linear), cell(finite)]))
     return lines
 
 
-def _mismatch(values: Mapping[str, Any]) -> list[str]:
-    """The scenes of benchmarks/mismatch.py."""
-    wide = any(row["half_width"] is not None for row in values["rows"].values())
-    head = ["scenes", "bodies", "RMS of ln E, prostate, bladder", "largest", *["half-width (median)"] * wide]
-    head += ["identified, weak, not identified", "95 % intervals that hold"]
-    lines = [_cells(head), _cells(["---"] * len(head))]
-    for name, row in values["rows"].items():
-        cells = [f"`{name}`", str(row["bodies"]), ", ".join(map(_number, row["rms"])), _number(row["largest"])]
-        cells += [_number(row["half_width"])] * wide
-        lines.append(_cells([*cells, ", ".join(map(str, row["verdicts"])), f"{row['held']} of {row['stated']}"]))
-    return lines
-
-
+MISMATCH: Columns = {
+    "scenes": "`{name}`",
+    "bodies": "{bodies}",
+    "RMS of ln E, prostate, bladder": lambda row: ", ".join(f"{value:.2f}" for value in row["rms"]),
+    "largest": "{largest:.2f}",
+    "half-width (median)": "{half_width:.2f}",
+    "identified, weak, not identified": lambda row: _listed(row["verdicts"]),
+    "95 % intervals that hold": "{held} of {stated}",
+}
 ROWS = {  # of benchmarks/coverage.py, as the table names them
     "gauss-0.1": "smooth noise of 0.1 mm",
     "gauss-0.2": "the same of 0.2 mm",
@@ -221,97 +254,62 @@ ROWS = {  # of benchmarks/coverage.py, as the table names them
     "field-0.5": "the same of 0.5 mm",
     "field-0.2": "the same of 0.2 mm",
 }
-
-
-def _coverage(values: Mapping[str, Any]) -> list[str]:
-    """The rows of benchmarks/coverage.py."""
-    head = ["row", "what is wrong or measured", "identified, weak, not identified", "95 % intervals that hold"]
-    head += ["error of ln E (median)"]
-    lines = [_cells(head), _cells(["---"] * len(head))]
-    for name, words in ROWS.items():
-        row = values["rows"][name]
-        verdicts = ", ".join(map(str, row["verdicts"]))
-        lines.append(_cells([f"`{name}`", words, verdicts, _held(row), _number(row["error"])]))
-    return lines
-
-
-def _speed(values: Mapping[str, Any]) -> list[str]:
-    """The default case of benchmarks/speed.py."""
-    head = ["law", "unknowns", "time", "peak memory", "time with frame and tissues held"]
-    lines = [_cells(head), _cells(["---"] * len(head))]
-    for law, row in values["laws"].items():
-        cells = [law, f"{row['unknowns']:,}".replace(",", " "), f"{row['seconds']:.0f} s", f"{row['peak_gb']:.1f} GB"]
-        lines.append(_cells([*cells, f"{row['held_seconds']:.0f} s"]))
-    return lines
-
-
-def _patients(values: Mapping[str, Any]) -> list[str]:
-    """The patients of benchmarks/patients.py, by noise and number of later images."""
-    head = ["surfaces off by", "later images", "patients", "error of ln E (RMS, median)", "half-width (median)"]
-    head += ["stated moduli", "95 % intervals that hold", "time of one processor", "peak memory"]
-    lines = [_cells(head), _cells(["---"] * len(head))]
-    for row in values["rows"].values():
-        errors = ", ".join(filter(None, (_number(row["rms"]), _number(row["error"]))))
-        cells = [_noise(row), str(row["images"]), str(row["patients"]), errors, _number(row["half_width"])]
-        cells += [_stated(row), _held(row), *_cost(row)]
-        lines.append(_cells(cells))
-    return lines
-
-
-def _patients_short(values: Mapping[str, Any]) -> list[str]:
-    """The same for README: what is stated."""
-    head = ["surfaces off by", "later images", "moduli with a stated interval", "of these hold", "median error of ln E"]
-    lines = [_cells(head), _cells(["---"] * len(head))]
-    for row in values["rows"].values():
-        cells = [_noise(row), str(row["images"]), _stated(row), _held(row), _number(row["error"])]
-        lines.append(_cells(cells))
-    return lines
+COVERAGE: Columns = {
+    "row": "`{name}`",
+    "what is wrong or measured": lambda row: ROWS[row["name"]],
+    "identified, weak, not identified": lambda row: _listed(row["verdicts"]),
+    "95 % intervals that hold": _held,
+    "error of ln E (median)": "{error:.2f}",
+}
+SPEED: Columns = {
+    "law": "{name}",
+    "unknowns": lambda row: f"{row['unknowns']:,}".replace(",", " "),
+    "time": "{seconds:.0f} s",
+    "peak memory": "{peak_gb:.1f} GB",
+    "time with frame and tissues held": "{held_seconds:.0f} s",
+}
+SOURCE: Columns = {
+    "surfaces off by": lambda row: f"{row['noise_mm']:g} mm" + ("" if row["law"] == "linear" else f", {row['law']}"),
+    "later images": "{images}",
+}
+COST: Columns = {
+    "time of one processor": "{seconds:.0f} s",
+    "peak memory": "{peak_gb:.1f} GB",
+}
+PATIENTS: Columns = {
+    **SOURCE,
+    "patients": "{patients}",
+    "error of ln E (RMS, median)": "{rms:.2f}, {error:.2f}",
+    "half-width (median)": "{half_width:.2f}",
+    "stated moduli": "{stated} of {moduli}",
+    "95 % intervals that hold": _held,
+    **COST,
+}
+PATIENTS_SHORT: Columns = {
+    **SOURCE,
+    "moduli with a stated interval": PATIENTS["stated moduli"],
+    "of these hold": PATIENTS["95 % intervals that hold"],
+    "median error of ln E": "{error:.2f}",
+}
 
 
 def _patients_cost(values: Mapping[str, Any]) -> list[str]:
-    """The same for the page of speed: what a number of later images costs at the largest noise."""
+    """For the page of speed: what a number of later images costs at the largest noise."""
     most = max((row["noise_mm"] for row in values["rows"].values()), default=0.0)
-    lines = [_cells(["later images", "time of one processor", "peak memory"]), _cells(["---"] * 3)]
-    rows = [row for row in values["rows"].values() if row["noise_mm"] == most]
-    return lines + [_cells([str(row["images"]), *_cost(row)]) for row in rows]
+    rows = {name: row for name, row in values["rows"].items() if row["noise_mm"] == most}
+    return table_of({"rows": rows}, {"later images": SOURCE["later images"], **COST})
 
 
-def _cohort(values: Mapping[str, Any]) -> list[str]:
-    """The effect of the stage in the cohort of benchmarks/patients.py."""
-    head = ["organ", "patients of the lower, the higher stage", "with a value, with an interval alone"]
-    head += ["factor found", "its 95 % interval", "p", "true factor", "of the moduli that were drawn"]
-    lines = [_cells(head), _cells(["---"] * len(head))]
-    for name, row in values["rows"].items():
-        cells = [name, ", ".join(map(str, row["patients"])), f"{row['stated']}, {row['censored']}"]
-        cells += [_number(row["factor"]), "" if row["undefined"] else _ends(row["interval95"]), _number(row["p"], 3)]
-        lines.append(_cells([*cells, _number(row["truth"]), _number(row["drawn"])]))
-    return lines
-
-
-def _ends(interval: Iterable[float | None]) -> str:
-    """An interval of which an end may be open."""
-    low, high = interval
-    if low is None or high is None:
-        return "open" if low is high else f"below {high:.2f}" if low is None else f"above {low:.2f}"
-    return f"{low:.2f} to {high:.2f}"
-
-
-def _noise(row: Mapping[str, Any]) -> str:
-    law = "" if row["law"] == "linear" else f", {row['law']}"
-    return f"{row['noise_mm']:g} mm{law}"
-
-
-def _stated(row: Mapping[str, Any]) -> str:
-    return f"{row['stated']} of {row['moduli']}"
-
-
-def _cost(row: Mapping[str, Any]) -> list[str]:
-    return [
-        "" if value is None else f"{value:.{digits}f} {unit}"
-        for value, digits, unit in ((row["seconds"], 0, "s"), (row["peak_gb"], 1, "GB"))
-    ]
-
-
+COHORT: Columns = {
+    "organ": "{name}",
+    "patients of the lower, the higher stage": lambda row: _listed(row["patients"]),
+    "with a value, with an interval alone": "{stated}, {censored}",
+    "factor found": "{factor:.2f}",
+    "its 95 % interval": lambda row: "" if row["undefined"] else _ends(row["interval95"]),
+    "p": "{p:.3f}",
+    "true factor": "{truth:.2f}",
+    "of the moduli that were drawn": "{drawn:.2f}",
+}
 FAMILIES = {  # of `palpate verify`: what each is, and with what it is compared
     "B0": "patch test, rotations, translation (exact)",
     "B1 to B3": "thick spheres and cylinders under pressure, nu up to 0.4999 (closed form; Code_Aster)",
@@ -329,32 +327,24 @@ FAMILIES = {  # of `palpate verify`: what each is, and with what it is compared
     "E3": "coverage of the 95 % intervals in 200 repeats (90 to 98 %)",
     "E4": "gradients against central differences (adjoint identity)",
 }
-
-
-def _verification(values: Mapping[str, Any]) -> list[str]:
-    """The families of problems with known answers."""
-    head = ["problems", "what (reference)", "error, %", "tolerance, %"]
-    lines = [_cells(head), _cells(["---"] * len(head))]
-    for name, (error, tolerance) in values["families"].items():
-        lines.append(_cells([name, FAMILIES[name], f"{error:.2g}", f"{tolerance:.2g}"]))
-    return lines
-
-
-def _cells(cells: Iterable[str]) -> str:
-    return f"| {' | '.join(cells)} |".replace("|  |", "| |").replace("|  |", "| |")
-
-
+VERIFICATION: Columns = {
+    "problems": "{name}",
+    "what (reference)": lambda row: FAMILIES[row["name"]],
+    "error, %": "{n0:.2g}",
+    "tolerance, %": "{n1:.2g}",
+}
 VIEWS = {
-    "accuracy.table": View("accuracy", "", _accuracy),
+    "accuracy.table": View("accuracy", "", partial(table_of, columns=ACCURACY, order=SEEN)),
     "accuracy.short": View("accuracy", "", _accuracy_short),
-    "mismatch.linear-table": View("mismatch", "linear", _mismatch),
-    "mismatch.finite-table": View("mismatch", "finite", _mismatch),
-    "mismatch.noise-table": View("mismatch", "noise", _mismatch),
-    "coverage.table": View("coverage", "", _coverage),
-    "patients.table": View("patients", "", _patients),
-    "patients.short": View("patients", "", _patients_short),
+    **{
+        f"mismatch.{of}-table": View("mismatch", of, partial(table_of, columns=MISMATCH)) for of in ("linear", "finite")
+    },
+    "mismatch.noise-table": View("mismatch", "noise", partial(table_of, columns=MISMATCH)),
+    "coverage.table": View("coverage", "", partial(table_of, columns=COVERAGE, order=ROWS)),
+    "patients.table": View("patients", "", partial(table_of, columns=PATIENTS)),
+    "patients.short": View("patients", "", partial(table_of, columns=PATIENTS_SHORT)),
     "patients.cost": View("patients", "", _patients_cost),
-    "patients.cohort-table": View("patients", "cohort", _cohort),
-    "speed.table": View("speed", "", _speed),
-    "verification.table": View("verification", "", _verification),
+    "patients.cohort-table": View("patients", "cohort", partial(table_of, columns=COHORT)),
+    "speed.table": View("speed", "", partial(table_of, columns=SPEED, branch="laws")),
+    "verification.table": View("verification", "", partial(table_of, columns=VERIFICATION, branch="families")),
 }

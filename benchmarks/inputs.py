@@ -1,6 +1,6 @@
 """Whether a body gives the same moduli from each kind of label file: the demo's labels, written in four ways.
 
-    python benchmarks/inputs.py [--inputs masks,dicom-seg,rtstruct] [--keep FOLDER] [--json]
+    python benchmarks/inputs.py [--inputs masks,dicom-seg,rtstruct] [--json]
 
 The demo's two label images are written as folders of masks under TotalSegmentator's names, as DICOM-SEG and as RTSTRUCT
 beside a CT series of their grid (the extra `dicom`; contours traced around the voxels, slice by slice). Each goes
@@ -17,12 +17,13 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rows import table_of
 
 from palpate.demo import DATA
 from palpate.images import LabelImage, read_label_image, write_label_image
@@ -32,16 +33,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from dicom_files import ct_slices, save_contours, save_segmentation, save_series, traced
 
 STATES = ("before", "after")
-ORGANS = {
-    "prostate": 1,
-    "urinary_bladder": 2,
-    "rectum": 3,
-    "sacrum": 6,
-    "hip_right": 7,
-    "hip_left": 8,
-    "femur_right": 9,
-    "femur_left": 10,
-}
+ORGANS = {"prostate": 1, "urinary_bladder": 2, "rectum": 3, "sacrum": 6}
+ORGANS |= {"hip_right": 7, "hip_left": 8, "femur_right": 9, "femur_left": 10}
 COLOUR = "#c08040"
 AS_THE_DEMO = ("mesh.edge_length_mm=10", "tissues.surroundings.youngs_modulus_kpa=10")
 VOLUMES = {"masks": 1e-3, "dicom-seg": 1e-3, "rtstruct": 1e-2}
@@ -55,20 +48,19 @@ def main() -> int:
     """Write the labels, estimate from each of them, print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--inputs", default=",".join(WRITERS))
-    parser.add_argument("--keep", type=Path, help="a folder for inputs and results, instead of a temporary one")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = arguments.keep or Path(temporary)
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
         images = {state: read_label_image(DATA / f"simulated_{state}.nii.gz") for state in STATES}
         demo = _estimates(DATA / "demo.toml", folder / "demo")
-        print(_line("demo", demo, {}), file=sys.stderr, flush=True)
         rows = []
-        for kind in arguments.inputs.split(","):
+        for kind in asked.inputs.split(","):
             found = _estimated(kind, folder / kind, images)
             rows.append({"input": kind, **found, **_judged(kind, found, demo)})
-            print(_line(kind, found["estimates"], rows[-1]), file=sys.stderr, flush=True)
-    print(json.dumps({"demo": demo, "inputs": rows}, indent=1) if arguments.json else _table(demo, rows))
+    for row in ({"input": "demo", "estimates": demo}, *rows):
+        print(row, file=sys.stderr)
+    print(json.dumps({"demo": demo, "inputs": rows}, indent=1) if asked.json else _table(rows))
     return 0 if all(row["as_wanted"] for row in rows) else 1
 
 
@@ -116,16 +108,13 @@ def _write_masks(folder: Path, image: LabelImage, masks: Masks) -> Path:
 
 
 def _write_segments(folder: Path, image: LabelImage, masks: Masks) -> Path:
-    slices, named, organs = _in_dicom(folder, image, masks)
-    path: Path = save_segmentation(folder / "segments.dcm", slices, "BINARY", named, organs)
-    return path
+    return Path(save_segmentation(folder / "segments.dcm", *_in_dicom(folder, image, masks)))
 
 
 def _write_contours(folder: Path, image: LabelImage, masks: Masks) -> Path:
-    slices, named, organs = _in_dicom(folder, image, masks)
+    slices, _, named, organs = _in_dicom(folder, image, masks)
     contours = {number: traced(mask, 0.5) for number, mask in organs.items()}
-    path: Path = save_contours(folder / "contours.dcm", slices, named, contours)
-    return path
+    return Path(save_contours(folder / "contours.dcm", slices, named, contours))
 
 
 WRITERS: Mapping[str, Callable[[Path, LabelImage, Masks], Path]] = {
@@ -137,8 +126,8 @@ WRITERS: Mapping[str, Callable[[Path, LabelImage, Masks], Path]] = {
 
 def _in_dicom(
     folder: Path, image: LabelImage, masks: Masks
-) -> tuple[Any, dict[int, tuple[str, str]], dict[int, NDArray[np.bool_]]]:
-    """A saved series of axial slices on the image's grid; names and masks (slices, rows, columns) by number."""
+) -> tuple[Any, str, dict[int, tuple[str, str]], dict[int, NDArray[np.bool_]]]:
+    """A saved series of axial slices on the image's grid; how segments are stored; names and masks by number."""
     affine = image.grid.affine
     spacing = np.diag(affine)[:3]
     if not np.allclose(affine[:3, :3], np.diag(spacing)) or spacing.min() <= 0.0:
@@ -150,7 +139,7 @@ def _in_dicom(
     save_series(folder / "ct", slices)
     named = {number: (name, COLOUR) for number, name in enumerate(masks, start=1)}
     turned = {number: mask[::-1, ::-1].transpose(2, 1, 0) for number, mask in enumerate(masks.values(), start=1)}
-    return slices, named, turned
+    return slices, "BINARY", named, turned
 
 
 def _centroid(image: LabelImage, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -171,24 +160,10 @@ def _palpate(*arguments: str) -> None:
     subprocess.run([sys.executable, "-m", "palpate", *arguments, "--quiet"], check=True)
 
 
-HEAD = ("| input | volumes differ by | centroids by | prostate, kPa | bladder, kPa | as wanted |", "|" + "---|" * 6)
-
-
-def _table(demo: Mapping[str, Any], rows: list[dict[str, Any]]) -> str:
-    return "\n".join([*HEAD, _line("demo", demo, {}), *(_line(row["input"], row["estimates"], row) for row in rows)])
-
-
-def _line(name: str, estimates: Mapping[str, Any], row: Mapping[str, Any]) -> str:
-    ends = [e["interval"] or ("none", "none") for e in estimates.values()]
-    moduli = [
-        f"{e['value']:.2f} ({low:.3g} to {high:.3g})" if low != "none" else f"{e['value']:.2f} (no interval)"
-        for e, (low, high) in zip(estimates.values(), ends, strict=True)
-    ]
-    judged = ["", "", *moduli, ""]
-    if row:
-        places = [f"{100.0 * row['volume']:.3f} %", f"{row['centroid_mm']:.3f} mm"]
-        judged = [*places, *moduli, "yes" if row["as_wanted"] else "no"]
-    return f"| {' | '.join([name, *judged])} |"
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    head = ["input", "volumes differ by", "centroids by", "moduli by", "as wanted"]
+    numbers = (("volume", "{:.3%}"), ("centroid_mm", "{:.3f} mm"), ("modulus", "{:.2%}"), ("as_wanted", "{}"))
+    return table_of(head, [[row["input"], *(form.format(row[key]) for key, form in numbers)] for row in rows])
 
 
 if __name__ == "__main__":

@@ -5,58 +5,44 @@
 Simulated pelves: a patient has one body and four pairs of label images, each with a motion and a noise of its own (0.3
 mm over 6 mm, voxels of 1 x 1 x 2.5 mm). Estimated are the first pair alone, all four together, and the same with the
 prostate of the fourth pair's later image shifted by 3 mm. The robust estimate is the random-effects mean of the pairs
-that are no outliers (`image_pairs` of a result); a pair is named by the warnings `pair-outlier` and `pair-noise`. A
-line of JSON a patient; another run with the same file adds to it.
+that are no outliers (`image_pairs` of a result); a pair is named by the warnings `pair-outlier` and `pair-noise`.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from functools import partial
 
 import numpy as np
+from accuracy import NOISE
+from rows import Job, Result, collected, mean, parser_of, printed, rms, seeds_of
 
 from palpate.body import ImagedStates, aligned
 from palpate.case import Case, Mechanics, Phantom
 from palpate.images import LabelImage, segment
-from palpate.phantoms import Noise, PelvisOptions, Scene, pelvis, pelvis_grid, reimaged
+from palpate.phantoms import PelvisOptions, Scene, pelvis, pelvis_grid, reimaged
 from palpate.study import estimate_states
 
 PAIRS = 4
-NOISE = Noise(surface_sd_mm=0.3, correlation_length_mm=6.0)
 SHIFT_MM, SHIFTED = 3.0, "prostate"
+TRUTH_EDGE_MM = 5.0
+TRIED = ("one", "four", "spoilt")
 
 
 def main() -> int:
     """Run what was asked for and print the summary."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--patients", type=int, default=20)
-    parser.add_argument("--first-seed", type=int, default=701)
+    parser = parser_of(__doc__ or "", output="pairs.jsonl", first_seed=701, seeds=20, name="--patients")
     parser.add_argument("--law", default="linear")
-    parser.add_argument("--output", type=Path, default=Path("pairs.jsonl"))
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
     asked = parser.parse_args()
-    rows = [json.loads(line) for line in asked.output.read_text().splitlines()] if asked.output.exists() else []
-    done = {(row["law"], row["seed"]) for row in rows}
-    for seed in range(asked.first_seed, asked.first_seed + asked.patients):
-        if (asked.law, seed) in done:
-            continue
-        rows.append({"law": asked.law, "seed": seed, **_patient(seed, asked.law)})
-        with asked.output.open("a") as file:
-            file.write(json.dumps(rows[-1]) + "\n")
-        print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
-    summary = _summary([row for row in rows if row["law"] == asked.law])
-    print(json.dumps(summary, indent=1) if asked.json else "\n".join(f"{k}: {v}" for k, v in summary.items()))
+    jobs = (Job({"law": asked.law, "seed": seed}, partial(_patient, seed, asked.law)) for seed in seeds_of(asked))
+    summary = summary_of([line for line in collected(jobs, asked, ("law", "seed")) if line["law"] == asked.law])
+    printed({asked.law: summary}, asked, {name: partial(_cell, name) for name in summary})
     return 0
 
 
-def _patient(seed: int, law: str) -> dict[str, Any]:
+def _patient(seed: int, law: str) -> Result:
     """Errors of ln E: of the first pair, of all four, and of all with a spoilt one."""
     rng = np.random.default_rng([seed, 5])
     scenes = [_scene(seed, number, law, float(rng.uniform(6.0, 8.0))) for number in range(PAIRS)]
@@ -70,7 +56,7 @@ def _patient(seed: int, law: str) -> dict[str, Any]:
 
 def _scene(seed: int, number: int, law: str, filling_mm: float) -> Scene:
     """One pair of images of a patient, with a noise of its own."""
-    options = PelvisOptions(seed, filling_mm, (1.0, 1.0, 2.5), truth_edge_mm=5.0, law=law, motion_seed=number)
+    options = PelvisOptions(seed, filling_mm, (1.0, 1.0, 2.5), truth_edge_mm=TRUTH_EDGE_MM, law=law, motion_seed=number)
     return reimaged(replace(pelvis(options), seed=seed + 1000 * number), pelvis_grid(options), noise=NOISE)
 
 
@@ -89,11 +75,16 @@ def _shifted(scene: Scene, rng: np.random.Generator) -> LabelImage:
     return replace(scene.after, labels=np.where(np.roll(organ, steps, axis), label, labels))
 
 
-def _estimated(case: Case, pairs: Sequence[ImagedStates], truth: Mapping[str, float]) -> dict[str, Any]:
+def _cell(name: str, row: Result) -> str:
+    """A figure of a row."""
+    return f"{row[name]:.3g}"
+
+
+def _estimated(case: Case, pairs: Sequence[ImagedStates], truth: Mapping[str, float]) -> Result:
     """Errors of ln E by organ, of the joint estimate, of every pair alone in it, and of the robust mean."""
     began = time.perf_counter()
     estimation = estimate_states(pairs, case, truth=truth).estimation
-    found: dict[str, Any] = {"status": estimation.status, "seconds": round(time.perf_counter() - began, 1)}
+    found: Result = {"status": estimation.status, "seconds": round(time.perf_counter() - began, 1)}
     found["joint"] = [
         None if e.value is None else float(np.log(e.value / truth[e.tissue])) for e in estimation.estimates
     ]
@@ -112,30 +103,25 @@ def _estimated(case: Case, pairs: Sequence[ImagedStates], truth: Mapping[str, fl
     return found
 
 
-def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def summary_of(rows: Sequence[Result]) -> Result:
     """Root mean squares over patients whose three estimates all converged, and how often the spoilt pair was named."""
-    whole = [row for row in rows if all(row[name]["status"] == "converged" for name in ("one", "four", "spoilt"))]
+    whole = [row for row in rows if all(row[name]["status"] == "converged" for name in TRIED)]
 
-    def rms(name: str, kind: str) -> float:
-        """Of one estimate."""
-        return float(np.sqrt(np.mean([np.square(row[name][kind]) for row in whole])))
+    def error(name: str, kind: str) -> float | None:
+        """RMS of ln E of one estimate."""
+        return rms(np.ravel([row[name][kind] for row in whole]))
 
-    one, four, robust, spoilt = (rms(*which) for which in (("one", "joint"), ("four", "joint"), ("four", "robust"),
-                                                           ("spoilt", "robust")))  # fmt: skip
     return {
         "patients": len(rows),
         "converged": len(whole),
-        "one pair": one,
-        "every pair alone": rms("four", "alone"),
-        "four pairs": four,
-        "four pairs over one": four / one,
-        "robust mean of four": robust,
-        "robust mean over one": robust / one,
-        "robust mean, one of four spoilt": spoilt,
-        "spoilt over good": spoilt / robust,
-        "joint, one of four spoilt": rms("spoilt", "joint"),
-        "spoilt pair named": float(np.mean([row["spoilt"]["named"][-1] for row in whole])),
-        "good pair named": float(np.mean([row["four"]["named"] for row in whole])),
+        "one pair": error("one", "joint"),
+        "every pair alone": error("four", "alone"),
+        "four pairs": error("four", "joint"),
+        "robust mean of four": error("four", "robust"),
+        "robust mean, one of four spoilt": error("spoilt", "robust"),
+        "joint, one of four spoilt": error("spoilt", "joint"),
+        "spoilt pair named": mean([row["spoilt"]["named"][-1] for row in whole]),
+        "good pair named": mean(np.ravel([row["four"]["named"] for row in whole])),
     }
 
 

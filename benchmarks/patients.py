@@ -2,7 +2,7 @@
 
     python benchmarks/patients.py [--images 1,2,4,8] [--noise 0.15,0.3] [--laws linear] [--patients 4]
                                   [--cohort [8]] [--cohort-images 6] [--cohort-noise 0.3]
-                                  [--first-seed 901] [--cache FOLDER] [--output FILE]
+                                  [--first-seed 901] [--cache FOLDER] [--output FILE] [--json]
     python benchmarks/patients.py --summary [--output FILE]      # no run: tables of the lines that are there
 
 Simulated patients, everything at once: one body, of which every later image shows another filling of the rectum (5 to
@@ -20,118 +20,60 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import resource
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from figures_text import VIEWS
-from numpy.typing import NDArray
-from patients_rows import EFFECT, figures_of
+from rows import Job, Result, collected, holds, median, parser_of, printed, rms, seeds_of
 
 import palpate
-from palpate.images import write_label_image
-from palpate.mechanics import law_named
-from palpate.mesh import OUTER, LagrangeSpace, lagrange_space, tetrahedralise
-from palpate.phantoms import (
-    AffineMotion,
-    BoundaryMotion,
-    PelvisOptions,
-    displacements,
-    imaged,
-    pelvis_anatomy,
-    pelvis_grid,
-    pelvis_motions,
-    refuse_folded,
-    rotation_about,
-    smooth_field,
-)
-from palpate_validation.mismatch import patched
-from palpate_validation.truth import ScaledMotion
+from palpate.cohort.records import Record, modulus_of
+from palpate.cohort.statistics.document import statistics_document
+from palpate.cohort.task import Row
+from scenes import EFFECT, MOST, Patient, patient_folder
 
-ORGANS = ("prostate", "bladder")
-MOST = 8  # later images of a patient that are made
-SPACING_MM, FIELD_MM, TRUTH_EDGE_MM = (1.0, 1.0, 2.0), (140.0, 146.0, 146.0), 3.0
-FILLING_MM, BORDER_MM, BORDER_LENGTH_MM = (5.0, 8.0), 1.0, 60.0
-SHIFT_MM, SHIFT_DEG = 3.0, 2.0
-FIELD_SD, FIELD_LENGTH_MM, NOISE_LENGTH_MM = 0.3, 25.0, 6.0
-LOWER_KPA, SCATTER = {"prostate": 25.0, "bladder": 30.0}, 0.2  # of the cohort: of the lower stage; sd of ln E
+KEYS = (*Patient._fields, "images")
 SHOWN = ("tissue", "value", "interval95", "verdict", "truth")
 KEPT = (*SHOWN, "parameter", "unit", "ratio", "ratio_interval95", "variance_shares", "profile")  # as statistics read it
-
-
-class Patient(NamedTuple):
-    """A simulated patient; stage: 0 or 1 in the cohort, None: a patient with the moduli of the seed."""
-
-    seed: int
-    law: str
-    noise_mm: float
-    stage: int | None = None
-
-    @property
-    def name(self) -> str:
-        """Of the folder."""
-        of_stage = "" if self.stage is None else f"-stage{self.stage}"
-        return f"patient-{self.seed}-{self.law}-{self.noise_mm:g}mm{of_stage}"
-
-    @property
-    def moduli_kpa(self) -> dict[str, float] | None:
-        """The moduli of a patient of the cohort: of its stage, scattered by the seed."""
-        if self.stage is None:
-            return None
-        scatter = SCATTER * np.random.default_rng([self.seed, 90]).normal(size=len(ORGANS))
-        return {
-            organ: LOWER_KPA[organ] * EFFECT[organ] ** self.stage * float(np.exp(away))
-            for organ, away in zip(ORGANS, scatter, strict=True)
-        }
+STATED = ("identified", "weak")
 
 
 def main() -> int:
     """Make what is not there, and run every estimate that the output does not hold yet."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    if sys.argv[1:2] == ["--one"]:
+        print(json.dumps(_estimated(Path(sys.argv[2]))))
+        return 0
+    parser = parser_of(__doc__ or "", output="patients.jsonl", first_seed=901, seeds=4, name="--patients")
     parser.add_argument("--images", default="1,2,4,8")
     parser.add_argument("--noise", default="0.15,0.3", help="standard deviations of the surfaces' errors, mm")
     parser.add_argument("--laws", default="linear")
-    parser.add_argument("--patients", type=int, default=4)
-    parser.add_argument("--first-seed", type=int, default=901)
     parser.add_argument("--cohort", type=int, nargs="?", const=8, default=0, help="patients of the cohort")
     parser.add_argument("--cohort-images", type=int, default=6, help="later images of each of them")
     parser.add_argument("--cohort-noise", type=float, default=0.3, help="their surfaces' errors, mm")
     parser.add_argument("--cache", type=Path, default=Path("patients"))
-    parser.add_argument("--output", type=Path, default=Path("patients.jsonl"))
-    parser.add_argument("--summary", action="store_true", help="run nothing: tables of the lines in the output")
-    parser.add_argument("--one", help=argparse.SUPPRESS)
     asked = parser.parse_args()
-    if asked.one:
-        print(json.dumps(_estimated(Path(asked.one))))
-        return 0
-    rows = [json.loads(line) for line in asked.output.read_text().splitlines()] if asked.output.exists() else []
-    if asked.summary:
-        print("\n".join(_summary(rows)))
-        return 0
     wanted = list(_wanted(asked))
     if wrong := sorted({n for _, n in wanted if not 0 < n <= MOST}):
         parser.error(f"{wrong} later images: a patient has 1 to {MOST}")
-    done = {(row["seed"], row["law"], row["noise_mm"], row.get("stage"), row["images"]) for row in rows}
-    for patient, n in wanted:
-        if (*patient, n) in done:
-            continue
-        row = {**patient._asdict(), "images": n, **_run(_case(patient_folder(patient, asked.cache), n))}
-        with asked.output.open("a") as file:
-            file.write(json.dumps(row) + "\n")
-        print(json.dumps(row), file=sys.stderr, flush=True)
+    jobs = (Job({**of._asdict(), "images": n}, partial(_run, of, n, asked.cache)) for of, n in wanted)
+    found = figures_of(collected(jobs, asked, KEYS))
+    if asked.json:
+        print(json.dumps({"simulated": True, **found}, indent=1))
+        return 0
+    printed(found["rows"], asked, COLUMNS)
+    printed(found["cohort"]["rows"], asked, COHORT_COLUMNS)
     return 0
 
 
 def _wanted(asked: argparse.Namespace) -> Iterator[tuple[Patient, int]]:
     """Each patient that is asked for, with a number of later images; the cohort comes last, its stages by turns."""
-    for seed in range(asked.first_seed, asked.first_seed + asked.patients):
+    for seed in seeds_of(asked):
         for law in asked.laws.split(","):
             for noise in map(float, asked.noise.split(",")):
                 for n in map(int, asked.images.split(",")):
@@ -141,25 +83,16 @@ def _wanted(asked: argparse.Namespace) -> Iterator[tuple[Patient, int]]:
             yield Patient(asked.first_seed + k, law, asked.cohort_noise, k % 2), asked.cohort_images
 
 
-def _summary(rows: list[dict[str, Any]]) -> list[str]:
-    """Both tables, as the pages have them."""
-    found = figures_of(rows)
-    lines = [*VIEWS["patients.table"].table(found), "", *VIEWS["patients.cohort-table"].table(found["cohort"])]
-    undefined = {name: row["undefined"] for name, row in found["cohort"]["rows"].items() if row["undefined"]}
-    failed = [f"{name}: {row['failed']} failed" for name, row in found["rows"].items() if row["failed"]]
-    return lines + [f"{name}: {words}" for name, words in undefined.items()] + failed
-
-
-def _run(case: Path) -> dict[str, Any]:
-    """The estimate of a case in a process of its own."""
-    command = [sys.executable, __file__, "--one", str(case)]
-    said = subprocess.run(command, capture_output=True, text=True, check=False)
+def _run(patient: Patient, n: int, cache: Path) -> Result:
+    """The estimate from the first n later images in a process of its own."""
+    case = patient_folder(patient, cache) / f"case-{n}.toml"
+    said = subprocess.run([sys.executable, __file__, "--one", case], capture_output=True, text=True, check=False)
     if said.returncode:
         return {"status": "failed", "reason": (said.stderr.strip().splitlines() or ["killed"])[-1]}
     return dict(json.loads(said.stdout.splitlines()[-1]))
 
 
-def _estimated(path: Path) -> dict[str, Any]:
+def _estimated(path: Path) -> Result:
     """What an estimate finds and takes."""
     began, truth = time.perf_counter(), json.loads((path.parent / "truth.json").read_text())["moduli_kpa"]
     document = palpate.estimate(palpate.read_case(path), truth=truth).to_dict()
@@ -175,82 +108,124 @@ def _estimated(path: Path) -> dict[str, Any]:
     }
 
 
-def _case(folder: Path, n: int) -> Path:
-    """The case of a patient's first n later images."""
-    path, truth = folder / f"case-{n}.toml", json.loads((folder / "truth.json").read_text())
-    after = json.dumps([f"after-{k}.nii.gz" for k in range(1, n + 1)])
-    lines = [f'id = "{folder.name}-{n}"  # simulated', "[images]", 'before = "before.nii.gz"', f"after = {after}"]
-    lines += ["[mechanics]", f'law = "{truth["law"]}"']
-    for name, entry in truth["tissues"].items():
-        lines += [f"[tissues.{name}]", *(f"{key} = {json.dumps(value)}" for key, value in entry.items())]
-    path.write_text("\n".join(lines) + "\n")
-    return path
+def figures_of(results: Sequence[Mapping[str, Any]]) -> Result:
+    """Both tables: {"rows": by noise and images, "cohort": {"rows": by organ}}, without rows where none is there."""
+    return {"rows": summary_of(results), "cohort": {"rows": stage_effects(results)}}
 
 
-def patient_folder(patient: Patient, cache: Path) -> Path:
-    """The folder of a patient in `cache`, made if it is not there: before, eight later images, truth.json."""
-    folder = cache / patient.name
-    if (folder / "truth.json").exists():
-        return folder
-    seed, law, noise_mm, stage = patient
-    rng = np.random.default_rng([seed, 89])
-    options = PelvisOptions(seed, field_mm=FIELD_MM, truth_edge_mm=TRUTH_EDGE_MM, spacing_mm=SPACING_MM, law=law)
-    options = replace(options, moduli_kpa=patient.moduli_kpa)
-    space = lagrange_space(tetrahedralise(pelvis_anatomy(options), edge_length_mm=TRUTH_EDGE_MM), "P2")
-    motions = [_motion(options, number, space, rng) for number in range(1, MOST + 1)]
-    patchy = patched(space.mesh, _patches(space, rng))
-    found = displacements(replace(space, mesh=patchy), motions, law=law_named(law))
-    made = folder.with_name(f".{folder.name}.{os.getpid()}")
-    made.mkdir(parents=True)
-    noises = np.random.default_rng([seed, 1]).spawn(MOST + 1)
-    grid = pelvis_grid(options)
-    still = np.zeros_like(space.points)
-    for number, (moved, of) in enumerate(zip([still, *found], noises, strict=True)):
-        refuse_folded(space, moved)
-        lies = still if number == 0 else _lies(rng).at(space.points + moved)
-        warp = smooth_field(of, sd_mm=noise_mm, correlation_mm=NOISE_LENGTH_MM).warp
-        name = f"after-{number}" if number else "before"
-        write_label_image(made / f"{name}.nii.gz", imaged(space, moved + lies, grid, warp=warp))
-    tissues = dict[str, dict[str, Any]]()
-    for label, tissue in enumerate(space.mesh.tissues, start=1):
-        known = tissue.name == "surroundings"
-        tissues[tissue.name] = {"label": "remaining" if known else label, "role": str(tissue.role)}
-        tissues[tissue.name] |= {"poisson_ratio": tissue.poisson_ratio} if tissue.meshed else {}
-        tissues[tissue.name] |= {"youngs_modulus_kpa": tissue.youngs_modulus_kpa} if known else {}
-    moduli = {t.name: t.youngs_modulus_kpa for t in space.mesh.tissues if t.name in ORGANS}
-    truth = {"simulated": True, "seed": seed, "law": law, "noise_mm": noise_mm, "stage": stage}
-    (made / "truth.json").write_text(json.dumps({**truth, "moduli_kpa": moduli, "tissues": tissues}, indent=1))
-    made.rename(folder)
-    return folder
+def summary_of(results: Sequence[Mapping[str, Any]]) -> dict[str, Result]:
+    """By noise and number of later images: patients, errors of ln E, half-widths, intervals that hold, cost.
+
+    rms, error: root mean square and median of |ln E / truth| over all moduli with a value; half_width: median of half
+    of ln(high / low) over all intervals with two ends; stated: moduli that are `identified` or `weak`; held: of these,
+    those whose interval holds the truth; seconds: median time of processors; peak_gb: the largest. None: no row says.
+    """
+    found = dict[str, Result]()
+    for kind, own in _kinds([row for row in results if row.get("stage") is None]).items():
+        law, noise, images = kind
+        items = [item for row in own for item in row.get("estimates", ())]
+        errors = [abs(np.log(item["value"] / item["truth"])) for item in items if item["value"] is not None]
+        ends = [item["interval95"] for item in items if item["interval95"]]
+        stated = [item for item in items if item["verdict"] in STATED]
+        found[_name(*kind)] = {
+            "law": law,
+            "noise_mm": noise,
+            "images": images,
+            "patients": len(own),
+            "failed": sum(row["status"] != "converged" for row in own),
+            "moduli": len(items),
+            "rms": rms(errors, 2),
+            "error": median(errors, 2),
+            "half_width": median([0.5 * np.log(high / low) for low, high in ends if low and high], 2),
+            "stated": len(stated),
+            "held": sum(holds(item["interval95"], item["truth"]) for item in stated),
+            "seconds": _rounded(_of(own, "processor_seconds", np.median), 1),
+            "peak_gb": _rounded(_of(own, "peak_gb", np.max)),
+        }
+    return found
 
 
-def _motion(options: PelvisOptions, number: int, space: LagrangeSpace, rng: np.random.Generator) -> BoundaryMotion:
-    """How the boundary moves in one later image: another filling, and a smooth motion of the border of 1 mm rms."""
-    filling = float(rng.uniform(*FILLING_MM))
-    walls = pelvis_motions(replace(options, filling_mm=filling, motion_seed=number))
-    drawn = smooth_field(rng, sd_mm=1.0, correlation_mm=BORDER_LENGTH_MM)
-    points = space.points[np.unique(space.facets(space.mesh.boundary[space.mesh.beyond == OUTER]))]
-    rms = float(np.sqrt(np.mean(np.sum(drawn.at(points) ** 2, axis=1))))
-    return BoundaryMotion(walls, ScaledMotion(drawn, BORDER_MM / rms))
+def stage_effects(results: Sequence[Mapping[str, Any]]) -> dict[str, Result]:
+    """By organ: the factor of its moduli from the lower to the higher stage, as `palpate statistics` finds it.
+
+    patients: of the lower and of the higher stage; stated, censored: those that the regression takes by their value,
+    and by their interval alone; factor, interval95, p: of the regression of ln E on the stage; truth: the factor that
+    the moduli were drawn with; drawn: ratio of the geometric means of those that were drawn, which scatters about it.
+    """
+    found = dict[str, Result]()
+    kinds = _kinds([row for row in results if row.get("stage") is not None])
+    for kind, own in kinds.items():
+        document = statistics_document([_record(row) for row in own])
+        for tissue, organ in document["organs"].items():
+            regression = organ["regression"]
+            drawn: tuple[list[float], list[float]] = ([], [])  # of each stage, ln E
+            for row in own:
+                truths = [item["truth"] for item in row.get("estimates", ()) if item["tissue"] == tissue]
+                drawn[row["stage"]].extend(np.log(truths))
+            found[tissue if len(kinds) == 1 else f"{tissue}, {_name(*kind)}"] = {
+                "noise_mm": kind[1],
+                "images": kind[2],
+                "patients": [sum(row["stage"] == stage for row in own) for stage in (0, 1)],
+                "stated": organ["used"]["scans"] - organ["used"]["censored"],
+                "censored": organ["used"]["censored"],
+                "factor": _rounded(regression.get("factor_per_stage")),
+                "interval95": [_rounded(end) for end in regression.get("interval95", (None, None))],
+                "p": _rounded(regression.get("p"), 3),
+                "truth": EFFECT[tissue],
+                "drawn": _rounded(np.exp(np.mean(drawn[1]) - np.mean(drawn[0])) if all(drawn) else None),
+                "undefined": regression.get("undefined", ""),
+            }
+    return found
 
 
-def _patches(space: LagrangeSpace, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Factors of E (n_tets,), in ln: a Gaussian field of its own in every tissue."""
-    mesh = space.mesh
-    drawn = smooth_field(rng, sd_mm=FIELD_SD, correlation_mm=FIELD_LENGTH_MM).at(mesh.nodes[mesh.tets].mean(axis=1))
-    factors = np.zeros(len(mesh.tets))
-    for component, name in enumerate(("surroundings", *ORGANS)):
-        here = mesh.region == mesh.tissue_index(name)
-        factors[here] = drawn[here, component]
-    return factors
+def _record(row: Mapping[str, Any]) -> Record:
+    """A row of the cohort as the cohort's statistics take it: one scan of one patient."""
+    name = f"{row['seed']}"
+    of = Row(name, name, stage=row["stage"])
+    if row["status"] != "converged":
+        return Record(of, "failed", "solver", str(row["reason"]))
+    moduli = tuple(modulus_of(item) for item in row["estimates"])
+    return Record(of, "done", moduli=moduli, seconds=row["seconds"], warnings=tuple(row["warnings"]))
 
 
-def _lies(rng: np.random.Generator) -> AffineMotion:
-    """Where the patient lies in a later image: 3 mm and 2 degrees elsewhere."""
-    way = rng.normal(size=3)
-    way *= SHIFT_MM / np.linalg.norm(way)
-    return AffineMotion(rotation_about(rng.normal(size=3), SHIFT_DEG) - np.eye(3), np.zeros(3), way)
+def _kinds(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, float, int], list[Mapping[str, Any]]]:
+    """The rows by law, noise (mm) and number of later images, in their order."""
+    keys = sorted({(row["law"], row["noise_mm"], row["images"]) for row in rows})
+    return {key: [row for row in rows if (row["law"], row["noise_mm"], row["images"]) == key] for key in keys}
 
+
+def _name(law: str, noise: float, images: int) -> str:
+    return f"{law}, {noise:g} mm, {images}"
+
+
+def _of(rows: Sequence[Mapping[str, Any]], key: str, what: Any) -> Any:
+    """What the rows that have that key come to; None where none has it."""
+    values = [row[key] for row in rows if key in row]
+    return what(values) if values else None
+
+
+def _rounded(value: Any, digits: int = 2) -> float | None:
+    return None if value is None else round(float(value), digits)
+
+
+COLUMNS = {
+    "patients (failed)": lambda row: f"{row['patients']} ({row['failed']})",
+    "error of ln E (RMS, median)": lambda row: f"{row['rms']:.2f}, {row['error']:.2f}",
+    "half-width (median)": lambda row: f"{row['half_width']:.2f}",
+    "stated moduli": lambda row: f"{row['stated']} of {row['moduli']}",
+    "95 % intervals that hold": lambda row: f"{row['held']} of {row['stated']}",
+    "time of one processor": lambda row: f"{row['seconds']:.0f} s",
+    "peak memory": lambda row: f"{row['peak_gb']:.1f} GB",
+}
+COHORT_COLUMNS = {
+    "patients": lambda row: str(row["patients"]),
+    "with a value, with an interval alone": lambda row: f"{row['stated']}, {row['censored']}",
+    "factor found": lambda row: row["undefined"] or f"{row['factor']:.2f}",
+    "its 95 % interval": lambda row: str(row["interval95"]),
+    "p": lambda row: f"{row['p']:.3f}",
+    "true factor": lambda row: f"{row['truth']:.2f}",
+    "of the moduli that were drawn": lambda row: f"{row['drawn']:.2f}",
+}
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -18,16 +18,15 @@ It also gives the limit: the ball's effect in standard deviations of the field's
 from __future__ import annotations
 
 import argparse
-import json
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache, partial
 from itertools import product
-from pathlib import Path
-from typing import Any, NoReturn
 
 import numpy as np
-from coverage_scenes import FIELD_MM, TRUTH_EDGE
 from numpy.typing import NDArray
+from rows import Job, Result, collected, parser_of, printed, seeds_of, silent
 from scipy import linalg
 from scipy.spatial.distance import cdist
 
@@ -35,108 +34,50 @@ from palpate.body import aligned, inverse_problem, make_body
 from palpate.case import Case, Mechanics, MeshSettings, Phantom
 from palpate.images import FieldPrior, segment
 from palpate.inversion import InverseProblem, invert
-from palpate.mechanics import law_named
-from palpate.mesh import LagrangeSpace, lagrange_space, located, point_interpolation, tetrahedralise
-from palpate.observation import DataFile, DisplacementField, PointDisplacement, PointTable, correlation
-from palpate.phantoms import (
-    BoundaryMotion,
-    Noise,
-    PelvisOptions,
-    Scene,
-    displacements,
-    imaged,
-    pelvis_anatomy,
-    pelvis_grid,
-    pelvis_motions,
-    reimaged,
-)
+from palpate.mesh import LagrangeSpace, located, point_interpolation
+from palpate.observation import PointDisplacement, correlation
+from palpate.phantoms import Noise, reimaged
 from palpate.study import inversion_settings
-from palpate.uncertainty import NORMAL_95, Interval, sandwich_covariance, stiffness_maps
-from palpate_validation.mismatch import patched
+from palpate.uncertainty import NORMAL_95, sandwich_covariance, stiffness_maps
+from scenes import BALL_RADIUS_MM, ORGANS, BodyWithBall, body_with_ball, point_term
 
 Array = NDArray[np.float64]
 
-ORGAN = "prostate"
-RADIUS_MM, DEPTH_MM = 7.0, 2.0  # of the ball, and of the tissue around it
+ORGAN = ORGANS[0]
 LATTICE_MM, ROUND_MM, ALIKE_MM = 4.0, 15.0, 5.0
 SURFACE_ALIKE_MM, ANOTHER = 6.0, 1000  # length of the surfaces' errors; between the seeds of two draws of them
 PRIOR = FieldPrior(0.7, 8.0)
+OPTIONS = {"--surface-sd-mm": 0.0, "--gland-kpa": 15.0, "--filling-mm": 14.0, "--contrast": 3.0, "--edge": 7.0}
+NAMES = [flag[2:].replace("-", "_") for flag in OPTIONS]
 
 
 def main() -> int:
     """Run what was asked for and print what was found."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--bodies", type=int, default=2)
+    parser = parser_of(__doc__ or "", output="stiffness_maps.jsonl", first_seed=801, seeds=2)
     parser.add_argument("--draws", type=int, default=1)
-    parser.add_argument("--first-seed", type=int, default=801)
     parser.add_argument("--field-sd-mm", type=float, nargs="+", default=[0.1])
-    parser.add_argument("--surface-sd-mm", type=float, default=0.0)
-    parser.add_argument("--gland-kpa", type=float, default=15.0)
-    parser.add_argument("--filling-mm", type=float, default=14.0)
-    parser.add_argument("--contrast", type=float, default=3.0)
-    parser.add_argument("--edge", type=float, default=7.0, help="edge length (mm) of the estimate's mesh")
-    parser.add_argument("--output", type=Path)
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    for flag, value in OPTIONS.items():
+        parser.add_argument(flag, type=float, default=value)
     asked = parser.parse_args()
-    found = []
-    for seed in range(asked.first_seed, asked.first_seed + asked.bodies):
-        options = _options(seed, asked.gland_kpa, asked.filling_mm)
-        truth = _truth(options, asked.contrast, asked.edge)
-        for sd, draw in product(asked.field_sd_mm, range(asked.draws)):
-            row = {"seed": seed, "draw": draw, "contrast": asked.contrast, "field_sd_mm": sd}
-            row |= {"surface_sd_mm": asked.surface_sd_mm}
-            drawn = _drawn(truth, asked.surface_sd_mm, draw)
-            found.append(row | _estimated(drawn, sd, asked.edge, draw))
-            if asked.output:
-                with asked.output.open("a") as file:
-                    file.write(json.dumps(found[-1]) + "\n")
-            if not asked.json:
-                print(json.dumps(found[-1]), flush=True)
-    if asked.json:
-        print(json.dumps({"simulated": True, "draws": found}, indent=1))
+    found = collected(_jobs(asked), asked, ("seed", "field_sd_mm", "draw", *NAMES))
+    printed({f"{r['seed']}, {r['field_sd_mm']:g} mm, {r['draw']}": r for r in found}, asked, COLUMNS)
     return 0
 
 
-@dataclass(frozen=True)
-class _Truth:
-    """A body with a ball; ln E over its tissue's geometric mean (n_tets,); the ball's centre (3,) mm.
+def _jobs(asked: argparse.Namespace) -> Iterator[Job]:
+    given = {name: getattr(asked, name) for name in NAMES}
+    body = lru_cache(maxsize=1)(body_with_ball)  # draws of one body come one after the other
 
-    without (n_points, 3) mm: the displacement of the body without the ball.
-    """
+    def row(seed: int, sd: float, draw: int) -> Result:
+        """One draw of a body."""
+        truth = body(seed, asked.gland_kpa, asked.filling_mm, asked.contrast, asked.edge)
+        return _estimated(truth, asked, sd, draw)
 
-    scene: Scene
-    log_ratio: Array
-    centre: Array
-    without: Array
-
-
-def _options(seed: int, gland_kpa: float, filling_mm: float) -> PelvisOptions:
-    drawn = float(np.random.default_rng([seed, 7]).uniform(6.0, 8.0))
-    moduli = {ORGAN: gland_kpa} if gland_kpa else None
-    return PelvisOptions(seed=seed, filling_mm=filling_mm or drawn, field_mm=FIELD_MM, moduli_kpa=moduli)
+    for key in product(seeds_of(asked), asked.field_sd_mm, range(asked.draws)):
+        yield Job(dict(zip(("seed", "field_sd_mm", "draw"), key, strict=True)) | given, partial(row, *key))
 
 
-def _truth(options: PelvisOptions, contrast: float, edge_mm: float) -> _Truth:
-    grid, law = pelvis_grid(options), law_named("linear")
-    mesh = tetrahedralise(pelvis_anatomy(options), edge_length_mm=TRUTH_EDGE * edge_mm)
-    space, number = lagrange_space(mesh, "P2"), next(i for i, t in enumerate(mesh.tissues) if t.name == ORGAN)
-    centres, own = mesh.nodes[mesh.tets].mean(axis=1), mesh.region == number
-    others, inside = centres[~own], np.flatnonzero(own)
-    depth = np.array([np.linalg.norm(others - place, axis=1).min() for place in centres[inside]])
-    deep = inside[depth > min(RADIUS_MM + DEPTH_MM, 0.95 * float(depth.max()))]
-    centre = centres[np.random.default_rng([options.seed, 42]).choice(deep)]
-    log_ratio = np.log(contrast) * (own & (np.linalg.norm(centres - centre, axis=1) < RADIUS_MM))
-    log_ratio[own] -= np.average(log_ratio[own], weights=mesh.volumes[own])
-    motion = BoundaryMotion(pelvis_motions(options))
-    motions = [
-        displacements(replace(space, mesh=patched(mesh, field)), [motion], law=law)[0]
-        for field in (np.zeros_like(log_ratio), log_ratio)
-    ]
-    before, after = (imaged(space, moved, grid) for moved in (np.zeros_like(motions[1]), motions[1]))
-    return _Truth(Scene(space, motions[1], before, after, motion.walls, options.seed), log_ratio, centre, motions[0])
-
-
-def _drawn(truth: _Truth, surface_sd_mm: float, draw: int) -> _Truth:
+def _drawn(truth: BodyWithBall, surface_sd_mm: float, draw: int) -> BodyWithBall:
     """The truth with its surfaces drawn in both images with errors of so many mm a component."""
     if not surface_sd_mm:
         return truth
@@ -145,19 +86,20 @@ def _drawn(truth: _Truth, surface_sd_mm: float, draw: int) -> _Truth:
     return replace(truth, scene=replace(scene, before=images.before, after=images.after))
 
 
-def _estimated(truth: _Truth, sd_mm: float, edge_mm: float, draw: int) -> dict[str, Any]:
+def _estimated(truth: BodyWithBall, asked: argparse.Namespace, sd_mm: float, draw: int) -> Result:
     """What the map says of one draw of the field's errors."""
+    truth, mesh = _drawn(truth, asked.surface_sd_mm, draw), MeshSettings(asked.edge)
     began, scene, log_ratio, centre = time.perf_counter(), truth.scene, truth.log_ratio, truth.centre
-    case = Case("map", phantom=Phantom("pelvis"), mesh=MeshSettings(edge_mm), mechanics=Mechanics("linear", "auto"))
+    case = Case("map", phantom=Phantom("pelvis"), mesh=mesh, mechanics=Mechanics("linear", "auto"))
     tissues = tuple(replace(t, field=PRIOR) if t.name == ORGAN else t for t in scene.tissues)
     before, after = (segment(image, tissues) for image in (scene.before, scene.after))
-    body = make_body(aligned(before, (after,), method="none"), case, progress=_silent)
-    problem = inverse_problem(body, case, progress=_silent)
+    body = make_body(aligned(before, (after,), method="none"), case, progress=silent)
+    problem = inverse_problem(body, case, progress=silent)
     state = problem.states[0]
     points, n_points, limit = _field(truth, body.space, sd_mm, np.random.default_rng([scene.seed, draw, 43]))
     state = state.with_observations([*state.observations, points])
     settings = inversion_settings(case, problem.parameters)
-    inversion = invert(InverseProblem((state,), problem.parameters), settings, progress=_silent)
+    inversion = invert(InverseProblem((state,), problem.parameters), settings, progress=silent)
     minimum = inversion.minimum
     (found,) = stiffness_maps(inversion, np.diag(sandwich_covariance(inversion.objective, minimum.evaluation)))
     places = body.space.mesh.nodes[body.space.mesh.tets[found.elements]].mean(axis=1)
@@ -166,7 +108,8 @@ def _estimated(truth: _Truth, sd_mm: float, edge_mm: float, draw: int) -> dict[s
     known = log_ratio[at.tet] + np.log(scene.tissues[names.index(ORGAN)].youngs_modulus_kpa or np.nan)
     theta = inversion.objective.parameters.moduli(minimum.unknowns)[names.index(ORGAN)]
     error = (found.log_ratio + np.log(theta) - known)[organ]
-    region, near = found.region, np.linalg.norm(places - centre, axis=1) < RADIUS_MM
+    region, near = found.region, np.linalg.norm(places - centre, axis=1) < BALL_RADIUS_MM
+    ends = [np.nan if end is None else end for end in region.interval95] if region else []
     return {
         "limit_sd": round(limit, 2),
         "converged": minimum.converged,
@@ -174,7 +117,7 @@ def _estimated(truth: _Truth, sd_mm: float, edge_mm: float, draw: int) -> dict[s
         "probability": region and round(region.probability, 4),
         "off_mm": region and round(float(np.linalg.norm(region.centre_mm - centre)), 2),
         "volume_ml": region and round(region.volume_ml, 2),
-        "region_contrast": region and [round(v, 2) for v in (region.contrast, *_numbers(region.interval95))],
+        "region_contrast": region and [round(v, 2) for v in (region.contrast, *ends)],
         "in_ball": [
             *(round(float(of[organ & near].mean()), 2) for of in (found.log_ratio, found.sd)),
             round(float(found.log_ratio[organ & ~near].mean()), 2),
@@ -190,7 +133,7 @@ def _estimated(truth: _Truth, sd_mm: float, edge_mm: float, draw: int) -> dict[s
 
 
 def _field(
-    truth: _Truth, space: LagrangeSpace, sd_mm: float, rng: np.random.Generator
+    truth: BodyWithBall, space: LagrangeSpace, sd_mm: float, rng: np.random.Generator
 ) -> tuple[PointDisplacement, int, float]:
     """Displacements on a lattice in and round the organ, with errors that are alike over a length; how many.
 
@@ -207,22 +150,17 @@ def _field(
     root = np.linalg.cholesky(correlation(cdist(places, places), ALIKE_MM) + 1e-9 * np.eye(len(places)))
     limit = float(np.linalg.norm(linalg.solve_triangular(root, by_ball, lower=True))) / sd_mm
     moved = moved + sd_mm * root @ rng.normal(size=(len(places), 3))
-    file = DataFile("field", "displacement-field", (Path("simulated.csv"),), 1, sd_mm, correlation_mm=ALIKE_MM)
-    table = PointTable(places, places + moved, ("",) * len(places), ())
-    return DisplacementField(file, table).on(space, _none)[0], len(places), limit
+    return point_term(space, places, moved, sd_mm, ALIKE_MM), len(places), limit
 
 
-def _numbers(interval: Interval) -> tuple[float, ...]:
-    return tuple(np.nan if end is None else end for end in interval)
-
-
-def _none(name: str, direction: Array) -> NoReturn:
-    raise AssertionError(f"a field needs no force on {name} along {direction}")
-
-
-def _silent(message: str) -> None:
-    del message
-
+COLUMNS = {
+    "limit": lambda row: f"{row['limit_sd']:.1f}",
+    "probability": lambda row: f"{row['probability']:.3f}",
+    "off": lambda row: f"{row['off_mm']:.1f} mm",
+    "contrast": lambda row: str(row["region_contrast"]),
+    "resolved": lambda row: f"{row['resolved']:.0%}",
+    "inside 95 %": lambda row: f"{row['inside_95']:.0%}",
+}
 
 if __name__ == "__main__":
     raise SystemExit(main())

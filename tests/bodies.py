@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import permutations
+from pathlib import Path
 from typing import Any
 
+import meshio
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -27,6 +29,8 @@ STILL = RigidMotion.identity()
 ELSEWHERE = RigidMotion(Rotation.from_rotvec(np.deg2rad([2.0, -1.0, 3.0])).as_matrix(), np.array([4.0, -3.0, 2.0]))
 FIELD = (110.0, 100.0, 100.0)
 VOXEL = 1.6
+BAR_MM = (20.0, 20.0, 30.0)
+HEAD = "before_x,before_y,before_z,after_x,after_y,after_z"
 
 
 def body(
@@ -63,6 +67,16 @@ def box_cells(counts: tuple[int, int, int], size: tuple[float, ...]) -> tuple[ND
         steps = np.cumsum(np.concatenate([np.zeros((1, 3), int), np.eye(3, dtype=int)[list(order)]]), axis=0)
         tets.append(np.stack([np.ravel_multi_index((corner + step).T, ends) for step in steps], axis=1))
     return index / (ends - 1) * size, np.concatenate(tets)
+
+
+def write_bar(folder: Path, *, strain: float, ratio: float) -> None:
+    """Files bar.vtu and field.csv: a bar, and points in it that move as it is pulled, with an error of 0.01 mm."""
+    size, rng = np.array(BAR_MM), np.random.default_rng(1)
+    nodes, tets = box_cells((4, 4, 6), BAR_MM)
+    meshio.write(folder / "bar.vtu", meshio.Mesh(nodes, [("tetra", tets)]))
+    points = rng.uniform(0.5, size - 0.5, (300, 3))
+    moved = strain * points * np.array([-ratio, -ratio, 1.0]) + 0.01 * rng.standard_normal((300, 3))
+    np.savetxt(folder / "field.csv", np.c_[points, points + moved], delimiter=",", header=HEAD, comments="")
 
 
 def with_first_pair(result: CaseResult, **changes: Any) -> CaseResult:

@@ -63,7 +63,7 @@ def answer(monkeypatch):
     def solve(*_args, **_options):
         raise SolvingError
 
-    monkeypatch.setattr(run, "inverted", solve)
+    monkeypatch.setattr(run, "invert_case", solve)
 
     def of(path: Path, overrides: Sequence[str] = ()) -> tuple[int, str]:
         checked = check_case(path, overrides, progress=silent)
@@ -352,6 +352,17 @@ def twins():
 def toys():
     """The module `toys`: objectives whose minimum is known by hand."""
     return loaded("inversion_toys", TESTS / "inversion" / "toys.py")
+
+
+@pytest.fixture(scope="session")
+def meshes():
+    """The module `structured_meshes` of the mechanics' tests."""
+    return loaded("structured_meshes", TESTS / "mechanics" / "structured_meshes.py")
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20240511)
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import random
 import re
 from pathlib import Path
@@ -124,36 +123,3 @@ def test_a_row_leads_to_the_page_where_its_code_is_explained():
         assert re.search(rf"^### {row['help'].removeprefix(address)}$", page, flags=re.MULTILINE)
     (strange,) = warning_rows([Finding("of-others", "x")])
     assert "help" not in strange
-
-
-def texts_of_findings():
-    """Every call of `Finding` in the program with the strings that its function can make its message of."""
-    for path in sorted((Path(__file__).parents[1] / "src").rglob("*.py")):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
-            calls = [
-                node
-                for node in ast.walk(function)
-                if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Finding" and len(node.args) > 1
-            ]
-            given = {
-                target.id: node.value
-                for node in ast.walk(function)
-                if isinstance(node, ast.Assign)
-                for target in node.targets
-                if isinstance(target, ast.Name)
-            }
-            for call in calls:
-                message = call.args[1]
-                message = given.get(message.id, message) if isinstance(message, ast.Name) else message
-                if isinstance(message, ast.Constant | ast.JoinedStr):
-                    parts = message.values if isinstance(message, ast.JoinedStr) else [message]
-                    text = "".join(part.value if isinstance(part, ast.Constant) else "0" for part in parts)
-                    yield pytest.param(text, id=f"{path.stem}-{call.lineno}")
-
-
-@pytest.mark.parametrize("text", [*texts_of_findings()])
-def test_a_message_as_it_is_written_says_what_is_wrong_and_then_what_to_do(text):
-    """With a word for each value; what is written in another way is measured as it is made (tests/conftest.py)."""
-    assert words_in(text) <= MOST_WORDS
-    assert len(SENTENCE_END.split(text)) <= 2

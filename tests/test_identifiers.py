@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import SimpleITK
 
+from case_texts import BALLS, LINEAR, case_text
 from dicom_files import ct_slices, save_contours, save_segmentation, save_series, traced
 from palpate.cli import main
 from palpate.images.label_image import LabelImage
@@ -23,40 +24,19 @@ from scenes import coarse_balls
 
 PLANTED = "Meyer^Erika"
 DATE = "19520229"
-CASE = """
-id = "balls"
-[images]
-before = "before.seg.nrrd"
-after = ["after.nii.gz"]
-intensities_before = "grey.mha"
-names = "labels.txt"
-[tissues.core]
-label = "core of it"
-role = "estimate"
-[tissues.shell]
-label = "shell"
-role = "estimate"
-[tissues.frame]
-label = "frame"
-role = "driver"
-[tissues.surroundings]
-label = "remaining"
-role = "known"
-youngs_modulus_kpa = 10.0
-[mesh]
-edge_length_mm = 9.0
-[mechanics]
-law = "linear"
-element = "P1"
-[noise]
-surface_sd_mm = 0.5
-[discrepancy]
-layer_sd = 0.0
-[driver]
-modes = 8
-[estimate]
-start_ratios = [2.0]
-"""
+NAMED = {"core": "core of it", "shell": "shell", "frame": "frame"}
+CASE = case_text(
+    BALLS | {tissue: BALLS[tissue] | {"label": name} for tissue, name in NAMED.items()},
+    id="balls",
+    before="before.seg.nrrd",
+    images={"intensities_before": "grey.mha", "names": "labels.txt"},
+    mesh={"edge_length_mm": 9.0},
+    mechanics=LINEAR,
+    noise={"surface_sd_mm": 0.5},
+    discrepancy={"layer_sd": 0.0},
+    driver={"modes": 8},
+    estimate={"start_ratios": [2.0]},
+)
 NAMES = {1: ("core of it", "#804020"), 2: ("shell", "#20c040"), 3: ("frame", "#4060ff")}
 
 

@@ -11,6 +11,7 @@ import nibabel
 import numpy as np
 import pytest
 
+from case_texts import ORGAN, REST, case_text
 from palpate import processes
 from palpate.body import refusals
 from palpate.errors import ResourceError
@@ -54,18 +55,7 @@ def test_what_the_environment_states_is_a_limit_if_it_is_a_plain_number(group, e
     assert processes.total_memory(**group) == (left if stated == "0.25" else 1e9)
 
 
-CASE = """
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-[tissues.prostate]
-label = 1
-role = "estimate"
-[tissues.surroundings]
-label = "remaining"
-role = "known"
-youngs_modulus_kpa = 3.0
-"""
+CASE = case_text({"prostate": ORGAN, "surroundings": REST})
 PEAK = """
 import palpate.cli
 palpate.cli.main(["check", "case.toml", "--quiet"])

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import palpate
 from palpate.parallel import mapped, processors
 
 
@@ -30,12 +27,6 @@ def test_what_numpy_is_told_to_let_pass_passes_in_every_thread(environment):
 def test_the_limit_of_the_linear_algebra_holds(environment):
     environment(OMP_NUM_THREADS="1")
     assert processors() == 1
-
-
-def test_nothing_else_counts_the_processors():
-    """What a queue or a container allows is known in one place."""
-    counting = [path.name for path in Path(palpate.__file__).parent.rglob("*.py") if "cpu_count" in path.read_text()]
-    assert counting == []  # but `multifrontal`, whose `processors` all use
 
 
 def test_a_limit_that_is_no_plain_number_is_none(environment):

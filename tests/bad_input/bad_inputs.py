@@ -10,39 +10,17 @@ from pathlib import Path
 import nibabel
 import numpy as np
 
+from case_texts import LINEAR, ORGAN, REST, case_text
+
 SPACING = 1.5
 AFFINE = np.diag([SPACING, SPACING, SPACING, 1.0])
-CASE = """
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-
-[tissues.prostate]
-label = 1
-role = "estimate"
-
-[tissues.rectum]
-label = 2
-role = "driver"
-
-[tissues.surroundings]
-label = "remaining"
-role = "known"
-youngs_modulus_kpa = 10.0
-
-[mechanics]
-law = "linear"
-element = "P1"
-
-[mesh]
-edge_length_mm = 6.0
-
-[driver]
-modes = 6
-
-[estimate]
-start_ratios = [1.0]
-"""
+CASE = case_text(
+    {"prostate": ORGAN, "rectum": {"label": 2, "role": "driver"}, "surroundings": REST},
+    mechanics=LINEAR,
+    mesh={"edge_length_mm": 6.0},
+    driver={"modes": 6},
+    estimate={"start_ratios": [1.0]},
+)
 
 
 def ball(centre, radius: float) -> np.ndarray:

@@ -24,6 +24,7 @@ from bad_inputs import (
     masks,
     named,
     nrrd,
+    other_grid,
     overlapping,
     replace_after,
     save,
@@ -32,8 +33,41 @@ from bad_inputs import (
     speck,
 )
 
+PRESSURE = '[[loads]]\nkind = "pressure"\nsurface = "rectum"\npressure_kpa = 0.5\n[estimate]'
+FIXED = '[mechanics]\nlaw = "linear"', '[domain]\nouter_boundary = "fixed"\n[mechanics]\nlaw = "linear"'
+
+
+def as_bone(folder):
+    """All that could move is one bone, on which the images are aligned."""
+    save(folder / "after.nii.gz", anatomy(shift=0.8))
+    changed(folder, '"driver"', '"rigid"')
+
+
+def under_pressure(folder):
+    """The rectum is a cavity, whose pressure is known."""
+    changed(folder, '"driver"', '"void"')
+    changed(folder, "[estimate]", PRESSURE)
+    changed(folder, *FIXED)
+
+
+def second_pair(folder):
+    """Whose later image is not there."""
+    text = '[[pairs]]\nbefore = "after.nii.gz"\nafter = ["none.nii.gz"]\n[tissues.prostate]'
+    changed(folder, "[tissues.prostate]", text)
+
+
+def damaged_grey(folder):
+    """A grey image that only the report would show."""
+    (folder / "grey.nii.gz").write_bytes(b"these are words")
+    changed(folder, '["after.nii.gz"]', '["after.nii.gz"]\nintensities_before = "grey.nii.gz"')
+
+
 REFUSED = {
-    "1 an empty file": (lambda f: (f / "after.nii.gz").write_bytes(b""), 3, "is empty (0 bytes)"),
+    "1 an empty file": (
+        lambda f: (f / "after.nii.gz").write_bytes(b""),
+        3,
+        "is empty (0 bytes); export or copy the image again",
+    ),
     "1 a file of ten bytes": (lambda f: cut(f / "after.nii.gz", 10), 3, "after.nii.gz"),
     "2 no gzip inside": (lambda f: (f / "after.nii.gz").write_bytes(b"these are words" * 99), 3, "gzip"),
     "3 a stream cut short": (lambda f: cut(f / "after.nii.gz", 200), 3, "cut short"),
@@ -88,7 +122,7 @@ REFUSED = {
     "19 a label in one image only": (
         lambda f: save(f / "after.nii.gz", np.where(anatomy(radius=6.0) == 1, 0, anatomy(radius=6.0))),
         3,
-        "has no voxel in 'after'",
+        "check its label in the images",
     ),
     "21 a speck": (lambda f: both(f, speck), 4, "has only 27 voxels"),
     "21 a sheet": (lambda f: both(f, sheet), 4, "nowhere two voxels thick"),
@@ -97,7 +131,12 @@ REFUSED = {
         4,
         "edge_length_mm",
     ),
-    "26 identical images": (lambda f: shutil.copy(f / "before.nii.gz", f / "after.nii.gz"), 3, "the same label image"),
+    "25 an edge longer than the body": (
+        lambda f: changed(f, "edge_length_mm = 6.0", "edge_length_mm = 500.0"),
+        4,
+        "less than the smallest side",
+    ),
+    "26 identical images": (lambda f: shutil.copy(f / "before.nii.gz", f / "after.nii.gz"), 3, "check the two paths"),
     "27 a volume that cannot be": (lambda f: save(f / "after.nii.gz", anatomy(radius=6.0, organ=8.5)), 3, "volume of"),
     "27 a motion that cannot be": (
         lambda f: [
@@ -107,7 +146,11 @@ REFUSED = {
         4,
         "field of view",  # laid on each other by the ball, the images share no rectum
     ),
-    "29 incompressible": (lambda f: changed(f, '"estimate"', '"estimate"\npoisson_ratio = 0.5'), 2, "-1 < nu < 0.5"),
+    "29 incompressible": (
+        lambda f: changed(f, '"estimate"', '"estimate"\npoisson_ratio = 0.5'),
+        2,
+        "-1 < nu < 0.5; soft tissue usually has 0.40 to 0.49",
+    ),
     "29 beyond all ratios": (
         lambda f: changed(f, '"estimate"', '"estimate"\npoisson_ratio = -1.0'),
         2,
@@ -123,11 +166,25 @@ REFUSED = {
     "36 a mistyped key": (lambda f: changed(f, "edge_length_mm", "edge_lenght_mm"), 2, "did you mean 'edge_length_mm'"),
     "36 a wrong type": (lambda f: changed(f, "modes = 6", 'modes = "six"'), 2, "whole number"),
     "36 keys in conflict": (lambda f: changed(f, "[1.0]", "[1.0]\nstarts_kpa = [9.0]"), 2, "say the same thing"),
-    "36 a missing file": (lambda f: (f / "after.nii.gz").unlink(), 3, "there is no file"),
+    "36 a missing file": (lambda f: (f / "after.nii.gz").unlink(), 3, "check the path"),
     "36 a path of 300 characters": (lambda f: replace_after(f, "x" * 300 + ".nii.gz"), 3, "cannot be opened"),
     "36 a case in another encoding": (lambda f: (f / "case.toml").write_bytes(b"\xff\xfei\x00"), 2, "UTF-8"),
-    "one label for two tissues": (lambda f: changed(f, "label = 2", "label = 1"), 2, "label 1 is claimed"),
-    "nothing that moves": (lambda f: changed(f, '"driver"', '"void"'), 2, "nothing moves this body"),
+    "a label in neither image": (lambda f: changed(f, "label = 1", "label = 7"), 3, "in 'before' and 'after'"),
+    "a wall that is gone": (lambda f: save(f / "after.nii.gz", (anatomy() == 1).astype(np.uint8)), 3, "'rectum'"),
+    "a load on nothing": (
+        lambda f: changed(f, "[estimate]", PRESSURE.replace('"rectum"', '"rektum"')),
+        2,
+        "no surface of the mesh is called 'rektum'",
+    ),
+    "one bone": (as_bone, 2, "nothing moves this body"),
+    "a second pair without its image": (second_pair, 3, "there is no file"),
+    "an unknown solver": (lambda f: changed(f, *FIXED[:1], FIXED[0] + '\nsolver = "best"'), 2, "solver"),
+    "one label for two tissues": (
+        lambda f: changed(f, "label = 2", "label = 1"),
+        2,
+        "a voxel can belong to one tissue only",
+    ),
+    "nothing that moves": (lambda f: changed(f, '"driver"', '"void"'), 2, "Give the role driver"),
 }
 
 
@@ -141,9 +198,18 @@ def test_what_is_refused_has_its_code_and_a_sentence_and_leaves_nothing(name, fo
     assert code != 4 or [path.name for path in (folder / "out").iterdir()] == ["log.txt"]
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_check_refuses_first_what_an_estimate_ends_with(name, folder, answer):
-    spoil, code, words = REFUSED[name]
+ACCEPTED = {
+    "good": lambda _: None,
+    "on another grid": other_grid,
+    "masks": masks,
+    "a cavity under pressure": under_pressure,
+    "a damaged grey image": damaged_grey,
+}
+
+
+@pytest.mark.parametrize("name", [*REFUSED, *ACCEPTED])
+def test_a_check_answers_first_what_an_estimate_ends_with(name, folder, answer):
+    spoil, code, words = REFUSED.get(name) or (ACCEPTED[name], 0, "")
     spoil(folder)
     found, sentence = answer(folder / "case.toml")
     assert found == code

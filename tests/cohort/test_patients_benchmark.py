@@ -20,7 +20,8 @@ def loaded(name):
 
 @pytest.fixture(scope="module")
 def rows():
-    return loaded("patients_rows")
+    assert {loaded(name).__name__ for name in ("rows", "scenes")} <= sys.modules.keys()  # which it imports
+    return loaded("patients")
 
 
 @pytest.fixture(scope="module")
@@ -127,13 +128,11 @@ def test_few_rows_and_rows_that_failed_make_tables(rows, text, n):
     assert len(text.VIEWS["patients.cohort-table"].table(found["cohort"])) == 2 + len(found["cohort"]["rows"])
 
 
-def test_the_moduli_of_a_cohort_scatter_about_those_of_their_stage(rows, text):
-    assert {rows.__name__, text.__name__} <= sys.modules.keys()  # which it imports by these names
-    patients = loaded("patients")
-    kpa = [[patients.Patient(seed, "linear", 0.3, stage).moduli_kpa for seed in range(400)] for stage in (0, 1)]
+def test_the_moduli_of_a_cohort_scatter_about_those_of_their_stage(rows):
+    kpa = [[rows.Patient(seed, "linear", 0.3, stage).moduli_kpa for seed in range(400)] for stage in (0, 1)]
     logs = {organ: np.log([[of[organ] for of in stage] for stage in kpa]) for organ in ("prostate", "bladder")}
     assert np.exp(logs["prostate"][1] - logs["prostate"][0]) == pytest.approx(1.3)
     assert logs["bladder"][1] == pytest.approx(logs["bladder"][0])
     assert logs["prostate"][0].std() == pytest.approx(0.2, abs=0.02)
     assert abs(np.corrcoef(logs["prostate"][0], logs["bladder"][0])[0, 1]) < 0.15
-    assert patients.Patient(901, "linear", 0.3).moduli_kpa is None
+    assert rows.Patient(901, "linear", 0.3).moduli_kpa is None

@@ -15,25 +15,19 @@ from pathlib import Path
 
 import pytest
 
+from case_texts import ORGAN, case_text
 from palpate.cohort.cluster import outcomes
 from palpate.cohort.plan import read_mark
 from palpate.cohort.progress import status_of
 from palpate.cohort.resolve import row_key
 from palpate.cohort.row import RowLostError, estimate_row
 from palpate.cohort.run import Options, run_cohort
-from palpate.cohort.task import Limits, Outcome, Row, Task
+from palpate.cohort.task import Limits, Row, Task
 from palpate.errors import ConfigurationError, ResourceError
 from palpate.progress import silent
 
 STUB = (str(Path(__file__).with_name("stub.py")),)
-TEMPLATE = """
-[tissues.prostate]
-label = 1
-role = "estimate"
-[tissues.rectum]
-label = 2
-role = "driver"
-"""
+TEMPLATE = case_text({"prostate": ORGAN, "rectum": {"label": 2, "role": "driver"}}, before=None, after=None)
 
 
 @pytest.fixture
@@ -297,8 +291,3 @@ def test_no_scheduler_is_an_error_of_resources(rows_that, tmp_path):
     with pytest.raises(ResourceError, match="no Dask scheduler answers at nowhere"):
         list(outcomes([task], scheduler="nowhere://here", workers=1))
     assert list(outcomes([], scheduler="nowhere://here", workers=1)) == []
-
-
-def test_an_outcome_is_plain():
-    outcome = Outcome("a", "done", seconds=1.0)
-    assert Outcome(**json.loads(json.dumps(outcome.to_dict()))) == outcome

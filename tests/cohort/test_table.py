@@ -8,6 +8,7 @@ from pathlib import Path
 import pyarrow.parquet
 import pytest
 
+from case_texts import ORGAN, case_text
 from palpate.cohort.records import Modulus, Record
 from palpate.cohort.resolve import case_of, row_key
 from palpate.cohort.table import read_derivatives, read_table
@@ -15,22 +16,15 @@ from palpate.cohort.tables import write_csv, write_parquet
 from palpate.cohort.task import Row
 from palpate.errors import ConfigurationError
 
-TEMPLATE = """
-id = "of the template"
-patient = "of the template"
-stage = 9
-[images]
-before = "nowhere/b.nii.gz"
-after = ["nowhere/a.nii.gz"]
-intensities_before = "nowhere/ct.nii.gz"
-align = "none"
-[tissues.prostate]
-label = 1
-role = "estimate"
-[tissues.rectum]
-label = 2
-role = "driver"
-"""
+TEMPLATE = case_text(
+    {"prostate": ORGAN, "rectum": {"label": 2, "role": "driver"}},
+    id="of the template",
+    patient="of the template",
+    stage=9,
+    before="nowhere/b.nii.gz",
+    after=["nowhere/a.nii.gz"],
+    images={"intensities_before": "nowhere/ct.nii.gz", "align": "none"},
+)
 
 
 @pytest.fixture

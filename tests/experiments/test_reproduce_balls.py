@@ -20,9 +20,9 @@ from palpate_validation.paper.balls import (
     pulled,
     random_grid,
 )
-from palpate_validation.paper.cohort import ORGANS, CohortSettings, estimate_patient, patient_space, true_moduli
+from palpate_validation.paper.columns import paper_estimate, paper_target
 from palpate_validation.paper.figure4 import LAW, Figure4Settings, figure4, nominal_stress
-from palpate_validation.paper.paper_method import paper_estimate, paper_target
+from palpate_validation.paper.staging import ORGANS, CohortSettings, estimate_patient, patient_space, true_moduli
 from palpate_validation.paper.table1 import Table1Settings, table1
 from palpate_validation.scenes import Ledger
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from palpate.errors import InputDataError
-from palpate.images.input_file import like, open_input, read_input
+from palpate.images.input_file import open_input, read_input, similar_names
 from palpate.images.label_image import VoxelGrid
 from palpate.images.readers import read_intensities, write_scalar_image
 
@@ -41,7 +41,7 @@ READINGS = {
 def test_a_mistyped_path_gets_the_one_that_is_like_it(mistyped, meant, tmp_path: Path) -> None:
     (tmp_path / "case").mkdir()
     (tmp_path / "case" / "before.nii.gz").write_bytes(CONTENT)
-    hint = like(tmp_path / mistyped)
+    hint = similar_names(tmp_path / mistyped)
     assert hint == ("" if meant is None else f", did you mean '{tmp_path / meant}'?")
     if "/" in mistyped:
         with pytest.raises(FileNotFoundError) as caught:

@@ -33,34 +33,6 @@ def test_every_spelling_gives_the_same_table(tmp_path: Path, text: str) -> None:
     assert list(read_label_table(path).items()) == [(1, "prostate"), (2, "bladder")]
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"", "not JSON"),
-        (b"{", "not JSON"),
-        (b"[" * 100_000, "not JSON"),
-        (b"[1, 2]", "names no label"),
-        (b"{}", "names no label"),
-        (b'{"1": "a", "1": "b"}', "twice"),
-        (b'{"1": "a", "2": "a"}', "twice"),
-        (b'{"-1": "a"}', "from 0"),
-        (b'{"70000": "a"}', "from 0"),
-        (b'{"a": "b"}', "from 0"),
-        (b'{"1": ""}', "characters"),
-        (b'{"1": {"name": "a"}}', "characters"),
-        (b'{"1": "a\\u001b[31m"}', "control characters"),
-        (b'{"1": "\xff"}', "UTF-8"),
-        (b'{"1": ' + b"9" * 5000 + b"}", "not JSON|from 0"),
-        (b" " * (2**20 + 1), "larger than"),
-    ],
-)
-def test_a_bad_table_is_refused_with_its_reason(tmp_path: Path, content: bytes, words: str) -> None:
-    path = tmp_path / "labels.json"
-    path.write_bytes(content)
-    with pytest.raises(InputDataError, match=words):
-        read_label_table(path)
-
-
 TABLES = {
     "snap.txt": '# IDX R G B A VIS MSH "LABEL"\n1 255 0 128 1 1 1 "left hip"\n 2  0  255  0  0.5  1 0  "bladder"\n',
     "snap.label": '1 255 0 128 1 1 1 "left hip"\n2 0 255 0 0.5 1 0 "bladder"\n',
@@ -153,8 +125,24 @@ def test_a_table_without_colours_or_with_impossible_ones_has_none(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "words"),
+    ("name", "content", "words"),
     [
+        ("a.json", b"", "not JSON"),
+        ("a.json", b"{", "not JSON"),
+        ("a.json", b"[" * 100_000, "not JSON"),
+        ("a.json", b"[1, 2]", "names no label"),
+        ("a.json", b"{}", "names no label"),
+        ("a.json", b'{"1": "a", "1": "b"}', "twice"),
+        ("a.json", b'{"1": "a", "2": "a"}', "twice"),
+        ("a.json", b'{"-1": "a"}', "from 0"),
+        ("a.json", b'{"70000": "a"}', "from 0"),
+        ("a.json", b'{"a": "b"}', "from 0"),
+        ("a.json", b'{"1": ""}', "characters"),
+        ("a.json", b'{"1": {"name": "a"}}', "characters"),
+        ("a.json", b'{"1": "a\\u001b[31m"}', "control characters"),
+        ("a.json", b'{"1": "\xff"}', "UTF-8"),
+        ("a.json", b'{"1": ' + b"9" * 5000 + b"}", "not JSON|from 0"),
+        ("a.json", b" " * (2**20 + 1), "larger than"),
         ("a.txt", '1 255 0 0 1 1 1 "a"\n2 0 0 0\n', "line 2"),
         ("a.txt", "1,prostate\n", "line 1 .* not of the form"),
         ("a.txt", "", "names no label"),
@@ -174,8 +162,8 @@ def test_a_table_without_colours_or_with_impossible_ones_has_none(tmp_path: Path
         ("a.tsv", "index name\n1 a\n", "lacks the columns"),
     ],
 )
-def test_a_bad_table_of_another_format_is_refused(tmp_path: Path, name: str, text: str, words: str) -> None:
-    (tmp_path / name).write_text(text)
+def test_a_bad_table_is_refused_with_its_reason(tmp_path: Path, name: str, content: str | bytes, words: str) -> None:
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(InputDataError, match=words) as caught:
         read_label_table(tmp_path / name)
     assert str(tmp_path / name) in str(caught.value)

@@ -68,13 +68,6 @@ def test_a_cropped_grid_keeps_its_places():
     assert part.world(index) == pytest.approx(GRID.world(index + np.array([5.0, 0.0, 60.0])))
 
 
-def test_the_window_ends_at_the_images_border():
-    mask = np.zeros(GRID.shape, dtype=bool)
-    mask[2:4, 58:, 40] = True
-    window = window_around(mask, GRID, reach_mm=6.0)
-    assert window == (slice(0, 9), slice(54, 60), slice(34, 47))
-
-
 def test_a_tissue_that_is_not_in_the_image_is_named(segmentation):
     with pytest.raises(InputDataError, match="'lost' has no voxel"):
         tissue_distance_map(segmentation, 2, smoothing_mm=0.9)

@@ -9,7 +9,7 @@ import pytest
 
 from palpate.images.tissue import Role, Tissue
 from palpate.inversion import InverseProblem, LaterState, invert
-from palpate.inversion.mixture import EVERY, LinearEvidence
+from palpate.inversion.linear_evidence import EVERY, LinearEvidence
 from palpate.inversion.objective import Evaluation
 from palpate.mechanics.boundary import outer_constraint
 from palpate.mechanics.linear_model import linear_model

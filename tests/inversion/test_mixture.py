@@ -15,7 +15,7 @@ from palpate.inversion import (
     gauss_newton,
     mixture_of,
 )
-from palpate.inversion.mixture import SEEN, TRUSTED_SD, LinearEvidence
+from palpate.inversion.linear_evidence import SEEN, TRUSTED_SD, LinearEvidence
 from palpate.observation.robust_loss import PowerLaw
 from palpate.unknowns.blocks import Choice
 

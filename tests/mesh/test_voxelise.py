@@ -1,8 +1,7 @@
-import itertools
-
 import numpy as np
 import pytest
 
+from bodies import box_cells
 from palpate.errors import GeometryError
 from palpate.images.label_image import VoxelGrid
 from palpate.images.tissue import Role, Tissue
@@ -19,18 +18,8 @@ TISSUES = (
 
 def ball_and_cavity(cells=8, size=16.0):
     """A cube of Kuhn tetrahedra around the origin: a stepped ball on one side, a hollow on the other."""
-    axis = np.linspace(-size / 2, size / 2, cells + 1)
-    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    nodes = nodes + 0.013 * np.array([1.0, 0.7, -0.4])  # off the voxel grid
-    number = np.arange(len(nodes)).reshape((cells + 1,) * 3)
-    tets = []
-    for order in itertools.permutations(range(3)):
-        corner = np.zeros((4, 3), dtype=int)
-        for k, direction in enumerate(order):
-            corner[k + 1] = corner[k] + np.eye(3, dtype=int)[direction]
-        blocks = [number[c[0] : c[0] + cells, c[1] : c[1] + cells, c[2] : c[2] + cells].ravel() for c in corner]
-        tets.append(np.stack(blocks, axis=1))
-    tets = np.concatenate(tets)
+    nodes, tets = box_cells((cells,) * 3, (size,) * 3)
+    nodes = nodes - size / 2 + 0.013 * np.array([1.0, 0.7, -0.4])  # off the voxel grid
     edges = nodes[tets][:, 1:] - nodes[tets][:, :1]
     flipped = np.linalg.det(edges) < 0
     tets[flipped] = tets[flipped][:, [0, 2, 1, 3]]

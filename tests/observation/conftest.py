@@ -2,27 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-
-@pytest.fixture(scope="session")
-def meshes():
-    """The module `structured_meshes`, loaded by its path: tests are no package."""
-    path = Path(__file__).parents[1] / "mechanics" / "structured_meshes.py"
-    spec = importlib.util.spec_from_file_location("structured_meshes", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(20240511)
 
 
 @pytest.fixture(scope="session")
@@ -46,13 +27,3 @@ def geodesic(subdivisions):
         triangles = np.concatenate([np.stack(child, axis=1) for child in children])
         vertices = np.concatenate([vertices, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
     return vertices, triangles
-
-
-@pytest.fixture(scope="session")
-def point_motion():
-    """The module `point_motion`, loaded by its path."""
-    spec = importlib.util.spec_from_file_location("point_motion", Path(__file__).with_name("point_motion.py"))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module

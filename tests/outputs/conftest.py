@@ -6,23 +6,12 @@ import dataclasses
 
 import pytest
 
+from case_texts import ORGAN, REST, case_text
 from palpate.cli import main
 from palpate.report import case_report
 from palpate.study import run as study_run
 
-CASE = """
-id = "ID"
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-[tissues.prostate]
-label = 1
-role = "estimate"
-[tissues.surroundings]
-label = "remaining"
-role = "known"
-youngs_modulus_kpa = 10.0
-"""
+CASE = case_text({"prostate": ORGAN, "surroundings": REST}, id="ID")
 
 
 def plain_page(data, **_):

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from case_texts import ORGAN, REST, case_text
 from children import in_a_child
 from palpate.case.file import read_case
 from palpate.cli import main
@@ -160,11 +161,7 @@ def test_a_parent_that_may_not_be_searched_ends_with_6(images, tmp_path):
 def test_an_output_never_replaces_an_input(tmp_path, capsys):
     for name, place in (("before", 7.0), ("after", 8.0)):
         write_label_image(tmp_path / f"{name}.nii.gz", ball(place))
-    (tmp_path / "case.toml").write_text(
-        '[images]\nbefore = "before.nii.gz"\nafter = ["after.nii.gz"]\n'
-        '[tissues.a]\nlabel = 1\nrole = "estimate"\nyoungs_modulus_kpa = 3.0\n'
-        '[tissues.b]\nlabel = "remaining"\nrole = "known"\nyoungs_modulus_kpa = 1.0\n'
-    )
+    (tmp_path / "case.toml").write_text(case_text({"a": ORGAN | {"youngs_modulus_kpa": 3.0}, "b": REST}))
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     assert main(["simulate", str(tmp_path / "case.toml"), "--output", str(tmp_path), "--quiet"]) == 2
     assert "before.nii.gz is an input of this run" in sentence(capsys)

@@ -13,7 +13,7 @@ import pytest
 from children import in_a_child
 from palpate.cli import main
 from palpate.study.lock import NAME
-from palpate.study.outputs import AREA, EARLIER, digests_of
+from palpate.study.outputs import EARLIER, digests_of
 
 FILES = {"result.json", "report.html", "report-data.npz", "mesh.vtu", "model.npz", "stiffness.nii.gz", "labels.csv"}
 FILES |= {"labels.nii.gz", "case.toml", "log.txt"}
@@ -129,17 +129,3 @@ def test_what_a_kill_leaves_is_told_and_does_not_stop_the_next_run(estimate, out
     assert estimate("bert", "--quiet") == 0
     assert {path.name for path in out.iterdir()} == FILES | {aside.name}
     assert result(out)["warnings"] == [{"code": "example", "message": "a warning to be shown"}]
-
-
-def test_a_disk_that_is_full_ends_with_6_and_the_earlier_files(estimate, out, capfd):
-    assert estimate("anna", "--quiet") == 0
-    before = contents(out)
-
-    def work() -> int:
-        os.write = Path.write_bytes = os.fsync = refuse(NO_SPACE)
-        return estimate("bert", "--quiet")
-
-    assert in_a_child(work) == 6
-    assert "No space left on device; free some space" in capfd.readouterr().err
-    assert contents(out) == before
-    assert not (out / AREA).exists()

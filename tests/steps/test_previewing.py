@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 
-import numpy as np
 import pytest
 
 import palpate
@@ -12,23 +11,8 @@ from palpate.body.cost import expected_cost
 from palpate.body.read import read_states
 from palpate.cli import main
 from palpate.errors import ConfigurationError
-from palpate.images.label_image import LabelImage, VoxelGrid
-from palpate.images.readers import write_label_image
 from palpate.progress import Forecast
 from palpate.report.preview import GENERATOR
-
-NAMES = {"1": "prostate", "2": "rectum", "3": "body"}
-
-
-@pytest.fixture
-def folder(tmp_path):
-    grid = VoxelGrid((24, 24, 24), np.diag([2.0, 2.0, 2.0, 1.0]))
-    for name, wall in (("before", 8), ("after", 9)):
-        labels = np.full(grid.shape, 3)
-        labels[8:16, 12:20, 8:16], labels[8:16, 4:wall, 4:20] = 1, 2
-        write_label_image(tmp_path / f"{name}.nii.gz", LabelImage(labels, grid))
-    (tmp_path / "names.json").write_text(json.dumps(NAMES))
-    return tmp_path
 
 
 def new_case(folder, names="names.json"):

@@ -78,15 +78,6 @@ def test_a_result_is_printed_a_line_a_tissue_with_open_ends_in_words(result):
     assert failed[1].startswith("prostate: no value, not identified: ")
 
 
-def test_the_representation_of_a_result_is_one_line(result):
-    ratio = {"verdict": "ratio only", "ratio": 3.12}
-    assert repr(with_estimates(result, {}, ratio)) == (
-        "<result of 'sub-01': prostate 58.9 kPa, bladder 3.12 x surroundings; 1 warning>"
-    )
-    lost = repr(with_estimates(result, status="not converged", reason="it stopped"))
-    assert lost == "<result of 'sub-01': not converged; prostate no value, bladder no value; 1 warning>"
-
-
 def test_names_in_cards_are_text(result):
     page = with_estimates(result, {"tissue": "<script>alert(1)</script>", "why": "<b>"})._repr_html_()
     assert "<script" not in page

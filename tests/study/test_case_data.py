@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from case_texts import LINEAR, ORGAN, REST, case_text
 from palpate.case.case import DriverMotion, MeshSettings
 from palpate.case.data import CaseData
 from palpate.case.file import read_case
@@ -28,52 +29,23 @@ from palpate.study.run import estimate
 from palpate.study.simulate import simulate
 
 TOY = Path(__file__).parents[1] / "observation" / "point_motion.py"
-CASE = """
-[images]
-before = "before.nii.gz"
-align = "none"
-
-[tissues.core]
-label = 1
-role = "estimate"
-youngs_modulus_kpa = 20.0
-
-[tissues.shell]
-label = 2
-role = "known"
-youngs_modulus_kpa = 10.0
-
-[tissues.tube]
-label = 3
-role = "driver"
-
-[motion]
-filling_mm = 4.0
-
-[mechanics]
-law = "linear"
-element = "P1"
-
-[domain]
-outer_boundary = "fixed"
-
-[mesh]
-edge_length_mm = 7.0
-
-[discrepancy]
-heterogeneity_sd = 0.0
-poisson_sd = 0.0
-layer_sd = 0.0
-
-[noise]
-surface_sd_mm = 0.3
-
-[driver]
-modes = 20
-
-[estimate]
-start_ratios = [4.0]
-"""
+CASE = case_text(
+    {
+        "core": ORGAN | {"youngs_modulus_kpa": 20.0},
+        "shell": REST | {"label": 2},
+        "tube": {"label": 3, "role": "driver"},
+    },
+    after=None,
+    images={"align": "none"},
+    motion={"filling_mm": 4.0},
+    mechanics=LINEAR,
+    domain={"outer_boundary": "fixed"},
+    mesh={"edge_length_mm": 7.0},
+    discrepancy={"heterogeneity_sd": 0.0, "poisson_sd": 0.0, "layer_sd": 0.0},
+    noise={"surface_sd_mm": 0.3},
+    driver={"modes": 20},
+    estimate={"start_ratios": [4.0]},
+)
 TRUTH = 20.0
 
 

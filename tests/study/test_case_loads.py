@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from case_texts import LINEAR, case_text
 from palpate.case.case import CaseLoad
 from palpate.case.file import read_case
 from palpate.errors import ConfigurationError
@@ -17,43 +18,20 @@ from palpate.mechanics.element import largest_strains
 from palpate.study.run import estimate
 from palpate.study.simulate import simulate
 
-CASE = """
-[images]
-before = "before.nii.gz"
-align = "none"  # the simulation holds the bone
-
-[tissues.bone]
-label = 1
-role = "rigid"
-
-[tissues.gland]
-label = 2
-role = "estimate"
-youngs_modulus_kpa = 16.0
-
-[tissues.sac]
-label = [5, 3]
-role = "estimate"
-youngs_modulus_kpa = 8.0
-
-[tissues.air]
-label = 0
-role = "void"
-
-[[loads]]
-kind = "gravity"
-acceleration_m_s2 = [3.0, 0.0, 0.0]  # as a table that tilts by 18 degrees does
-
-[mechanics]
-law = "linear"
-element = "P1"
-
-[mesh]
-edge_length_mm = 5.0
-
-[estimate]
-start_ratios = [4.0, 32.0]  # kPa, for no tissue is known
-"""
+CASE = case_text(
+    {
+        "bone": {"label": 1, "role": "rigid"},
+        "gland": {"label": 2, "role": "estimate", "youngs_modulus_kpa": 16.0},
+        "sac": {"label": [5, 3], "role": "estimate", "youngs_modulus_kpa": 8.0},
+        "air": {"label": 0, "role": "void"},
+    },
+    after=None,
+    images={"align": "none"},  # the simulation holds the bone
+    loads=[{"kind": "gravity", "acceleration_m_s2": [3.0, 0.0, 0.0]}],  # as a table that tilts by 18 degrees does
+    mechanics=LINEAR,
+    mesh={"edge_length_mm": 5.0},
+    estimate={"start_ratios": [4.0, 32.0]},  # kPa, for no tissue is known
+)
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import json
 
 import pytest
 
+from case_texts import BALLS, ORGAN, REST, case_text
 from palpate.body import cost
 from palpate.body.cost import expected_cost, expected_tets
 from palpate.case.file import read_case
@@ -14,23 +15,24 @@ from palpate.cli import main
 from palpate.errors import ResourceError
 from palpate.images.readers import write_label_image
 from palpate.mechanics.solvers import registry
+from palpate.progress import silent
 from palpate.study import check
 from palpate.study.check import check_case
 from palpate.study.run import estimate
 from scenes import coarse_balls
 
-
-def silent(_: str) -> None:
-    """Nobody listens."""
+FRAMED = {"core": ORGAN, "frame": BALLS["frame"], "rest": REST}
 
 
 def test_every_problem_is_listed_and_the_first_is_what_an_estimate_ends_with(tmp_path, without):
     for name in ("before.nii.gz", "after.nii.gz"):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "case.toml").write_text(
-        '[images]\nbefore = "before.nii.gz"\nafter = ["after.nii.gz", "none.nii.gz"]\n[tissues.prostate]\nlabel = 1\n'
-        'role = "estimate"\n[tissues.rest]\nlabel = "remaining"\nrole = "known"\nyoungs_modulus_kpa = 1e5\n'
-        "[estimate]\nsamples = 1000\n"
+        case_text(
+            {"prostate": ORGAN, "rest": REST | {"youngs_modulus_kpa": 1e5}},
+            after=["after.nii.gz", "none.nii.gz"],
+            estimate={"samples": 1000},
+        )
     )
     without("h5netcdf")
     found = check_case(tmp_path / "case.toml", (), progress=silent)
@@ -60,13 +62,9 @@ def test_a_case_that_cannot_be_read_is_a_problem_with_its_code(tmp_path, capsys)
 def test_one_cause_in_many_images_and_pairs_is_one_line(tmp_path):
     """The same image eight times, and in a second pair; a finding on an organ in all of them, too."""
     write_label_image(tmp_path / "before.nii.gz", coarse_balls().before)
-    again, twice = (", ".join(['"before.nii.gz"'] * count) for count in (8, 2))
-    (tmp_path / "case.toml").write_text(
-        f'[images]\nbefore = "before.nii.gz"\nafter = [{again}]\nalign = "none"\n'
-        f'[[pairs]]\nbefore = "before.nii.gz"\nafter = [{twice}]\n'
-        '[tissues]\ncore = { label = 1, role = "estimate" }\nframe = { label = 3, role = "driver" }\n'
-        'rest = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }\n'
-    )
+    again = ["before.nii.gz"]
+    pairs = [{"before": "before.nii.gz", "after": 2 * again}]
+    (tmp_path / "case.toml").write_text(case_text(FRAMED, after=8 * again, images={"align": "none"}, pairs=pairs))
     found = check_case(tmp_path / "case.toml", (), progress=silent)
     (same,) = (problem.message for problem in found.problems if "same label image" in problem.message)
     assert same.startswith("'before' and 'after[1]' are the same")
@@ -137,11 +135,7 @@ def test_what_else_runs_does_not_change_what_is_expected(case_result, monkeypatc
 def test_an_estimate_is_refused_for_the_memory_that_a_check_refuses_it_for(tmp_path):
     for name, image in (("before", coarse_balls().before), ("after", coarse_balls().after)):
         write_label_image(tmp_path / f"{name}.nii.gz", image)
-    (tmp_path / "case.toml").write_text(
-        '[images]\nbefore = "before.nii.gz"\nafter = ["after.nii.gz"]\n[mesh]\nedge_length_mm = 0.1\n'
-        '[tissues]\ncore = { label = 1, role = "estimate" }\nframe = { label = 3, role = "driver" }\n'
-        'rest = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }\n'
-    )
+    (tmp_path / "case.toml").write_text(case_text(FRAMED, mesh={"edge_length_mm": 0.1}))
     found = check_case(tmp_path / "case.toml", (), progress=silent)
     (refused,) = (problem for problem in found.problems if problem.code == "memory")
     with pytest.raises(ResourceError, match="memory would be needed") as told:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from case_texts import BALLS, case_text
 from palpate.case.file import read_case
 from palpate.images.readers import write_label_image
 from palpate.phantoms.spheres import SpheresOptions, spheres
@@ -12,24 +13,7 @@ from palpate.study.run import estimate
 
 TRUTH_KPA = {"core": 60.0, "shell": 30.0}
 VALLEY = 3  # the body whose posterior is a valley: 4 000 draws are two dozen effective ones, which tell of no quantile
-CASE = """
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-
-[tissues]
-core = { label = 1, role = "estimate" }
-shell = { label = 2, role = "estimate" }
-frame = { label = 3, role = "driver" }
-surroundings = { label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }
-
-[mesh]
-edge_length_mm = 8.0
-[driver]
-modes = 20
-[estimate]
-start_ratios = [3.0]
-"""
+CASE = case_text(BALLS, mesh={"edge_length_mm": 8.0}, driver={"modes": 20}, estimate={"start_ratios": [3.0]})
 
 
 @pytest.fixture(scope="module", params=[1, 2, 3])

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import palpate
+from case_texts import BALLS, LINEAR, case_text
 from palpate.body.body import joint_problem, make_body
 from palpate.body.read import read_states
 from palpate.cli import main
@@ -24,32 +25,18 @@ from palpate.statement.known_images import FORMAT, KnownImages, added_name, dige
 from palpate.study.archive import read_archive, write_archive
 from palpate.study.outputs import KNOWN_IMAGES
 
-CASE = """
-[images]
-before = "before.nii.gz"
-after = [{after}]
-[tissues]
-core = {{ label = 1, role = "estimate" }}
-shell = {{ label = 2, role = "estimate" }}
-frame = {{ label = 3, role = "driver" }}
-surroundings = {{ label = "remaining", role = "known", youngs_modulus_kpa = 10.0 }}
-[mechanics]
-law = "linear"
-element = "P1"
-[mesh]
-edge_length_mm = 8
-[driver]
-modes = 12
-[discrepancy]
-layer_sd = 0
-heterogeneity_sd = 0.1
-surface_offset_mm = 0.1
-"""
 PUSHES = (3.0, 4.0, 5.0, -4.0)
 
 
 def case_of(numbers) -> str:
-    return CASE.format(after=", ".join(f'"after_{n}.nii.gz"' for n in numbers))
+    return case_text(
+        BALLS,
+        after=[f"after_{n}.nii.gz" for n in numbers],
+        mechanics=LINEAR,
+        mesh={"edge_length_mm": 8},
+        driver={"modes": 12},
+        discrepancy={"layer_sd": 0, "heterogeneity_sd": 0.1, "surface_offset_mm": 0.1},
+    )
 
 
 def run(folder: Path, *words: object) -> int:

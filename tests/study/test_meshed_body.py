@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import palpate
-from bodies import box_cells
+from bodies import BAR_MM, HEAD, box_cells, write_bar
 from mesh_writers import abaqus, block, gmsh_2, gmsh_4, numbered
 from palpate.body.body import inverse_problem, make_body
 from palpate.body.cost import expected_cost
@@ -34,7 +34,7 @@ from palpate.report.collect import collect
 from palpate.study.check import check_case
 from palpate.study.run import estimate
 
-SIZE, STRAIN, MODULUS, RATIO = (20.0, 20.0, 30.0), 0.04, 50.0, 0.3
+SIZE, STRAIN, MODULUS, RATIO = BAR_MM, 0.04, 50.0, 0.3
 FORCE_N = 1e-3 * MODULUS * SIZE[0] * SIZE[1] * STRAIN  # Hooke's, of a bar that may narrow
 CASE = f"""
 [body]
@@ -89,13 +89,7 @@ def cells():
 def folder(tmp_path_factory):
     """The bar, its exact motion with noise, and the case."""
     folder = tmp_path_factory.mktemp("bar")
-    nodes, tets = cells()
-    meshio.write(folder / "bar.vtu", meshio.Mesh(nodes, [("tetra", tets)]))
-    rng = np.random.default_rng(1)
-    points = rng.uniform(0.5, np.array(SIZE) - 0.5, (300, 3))
-    moved = STRAIN * points * np.array([-RATIO, -RATIO, 1.0]) + 0.01 * rng.standard_normal((300, 3))
-    head = "before_x,before_y,before_z,after_x,after_y,after_z"
-    np.savetxt(folder / "field.csv", np.c_[points, points + moved], delimiter=",", header=head, comments="")
+    write_bar(folder, strain=STRAIN, ratio=RATIO)
     (folder / "case.toml").write_text(CASE)
     return folder
 
@@ -166,8 +160,7 @@ def test_a_motion_along_the_pull_that_the_model_lacks_is_told_beside_the_verdict
     assert "data-misfit" not in [remark.code for remark in result.all_remarks]
     table = np.loadtxt(folder / "field.csv", delimiter=",", skiprows=1)
     table[:, 5] -= 0.05 * np.exp(-0.5 * ((table[:, 2] - 0.5 * SIZE[2]) / 6.0) ** 2) * np.cos(table[:, 0] / 3.0)
-    head = "before_x,before_y,before_z,after_x,after_y,after_z"
-    np.savetxt(folder / "otherwise.csv", table, delimiter=",", header=head, comments="")
+    np.savetxt(folder / "otherwise.csv", table, delimiter=",", header=HEAD, comments="")
     (folder / "otherwise.toml").write_text(CASE.replace("field.csv", "otherwise.csv"))
     assert main(["estimate", str(folder / "otherwise.toml"), "--output", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
@@ -179,12 +172,6 @@ def test_a_motion_along_the_pull_that_the_model_lacks_is_told_beside_the_verdict
     (warning,) = (warning for warning in document["warnings"] if warning["code"] == "data-misfit")
     assert "along z (superior)" in warning["message"]
     assert (tmp_path / "out" / "report.html").exists()
-
-
-def test_check_finds_no_fault(folder):
-    report = check_case(folder / "case.toml", [], progress=lambda _: None)
-    assert report.exit_code == 0
-    assert report.cost.tets == 576
 
 
 def test_the_cost_of_a_mesh_is_told_by_its_own_tetrahedra_and_states(folder):
@@ -216,14 +203,6 @@ def test_groups_of_a_mesh_are_tissues_by_name_or_number(folder, tmp_path):
     (tmp_path / "case.toml").write_text(CASE.replace("label = 1", "label = 7"))
     with pytest.raises(ConfigurationError, match="belong to no tissue"):
         read_states(read_case(tmp_path / "case.toml"))
-
-
-def test_tetrahedra_have_their_volume_whatever_the_order_of_their_corners(folder):
-    file = read_mesh_file(folder / "bar.vtu")
-    corners = file.nodes[file.tets]
-    volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
-    assert volumes.min() > 0.0
-    assert volumes.sum() == pytest.approx(np.prod(SIZE))
 
 
 @pytest.mark.parametrize(
@@ -282,9 +261,8 @@ boundary = "sliding"
 def body_of(folder, case, moved, *, surfaces=SLIDING, spread=0.0):
     """The model of the bar under a case whose surfaces are `surfaces` and whose field is `moved` of points."""
     points = np.random.default_rng(2).uniform(0.0, SIZE, (200, 3))
-    head = "before_x,before_y,before_z,after_x,after_y,after_z"
     noise = spread * np.random.default_rng(3).standard_normal(points.shape)
-    np.savetxt(folder / "exact.csv", np.c_[points, moved(points) + noise], delimiter=",", header=head, comments="")
+    np.savetxt(folder / "exact.csv", np.c_[points, moved(points) + noise], delimiter=",", header=HEAD, comments="")
     head, tail = case.split("[[surfaces]]")[0], case[case.index("[tissues.bar]") :]
     (folder / "walls.toml").write_text((head + surfaces + tail).replace("field.csv", "exact.csv"))
     return problem_of(read_case(folder / "walls.toml"))
@@ -366,12 +344,6 @@ def test_a_surface_that_makes_no_sense_is_refused_in_a_sentence(folder, change, 
     assert (code, bool(re.search(words, sentence))) == (error.exit_code, True), sentence
 
 
-def test_a_sliding_role_is_of_surfaces_alone(folder):
-    (folder / "wrong.toml").write_text(CASE.replace('role = "estimate"', 'role = "sliding"'))
-    with pytest.raises(ConfigurationError, match="did you mean"):
-        read_case(folder / "wrong.toml")
-
-
 def test_exports_repeat_each_states_motion_and_loads(folder, tmp_path):
     """A bar that is pulled in its first later state and pressed, by half as much, in its second."""
     loads = "".join(
@@ -379,12 +351,11 @@ def test_exports_repeat_each_states_motion_and_loads(folder, tmp_path):
         for state, kpa in ((1, STRAIN * MODULUS), (2, -0.5 * STRAIN * MODULUS))
     )
     before = np.random.default_rng(4).uniform(0.5, np.array(SIZE) - 0.5, (300, 3))
-    head = "before_x,before_y,before_z,after_x,after_y,after_z"
     moved = STRAIN * before * np.array([-RATIO, -RATIO, 1.0])
     data = ""
     for state, share in ((1, 1.0), (2, -0.5)):
         table = np.c_[before, before + share * moved]
-        np.savetxt(folder / f"state{state}.csv", table, delimiter=",", header=head, comments="")
+        np.savetxt(folder / f"state{state}.csv", table, delimiter=",", header=HEAD, comments="")
         data += f'[[data]]\nkind = "displacement-field"\nfile = "state{state}.csv"\nsd_mm = 0.01\nstate = {state}\n'
     text = (
         CASE.split("[[data]]", maxsplit=1)[0].replace('name = "grip"', 'boundary = "free"\nname = "grip"')

@@ -99,7 +99,7 @@ def test_check_makes_the_mesh_of_the_estimate_and_predicts_its_cost(case_result,
     found = check_case(on_disk, [f"mesh.edge_length_mm={edge}"], progress=silent)
     assert found.exit_code == code
     assert len(tried) == 3
-    states = ImagedStates(case_result.before, case_result.after, ({},), ())
+    states = ImagedStates(case_result.before, case_result.pairs[0].later)
     if code:
         assert [problem.code for problem in found.problems if problem.exit_code] == ["MeshQualityError"]
         assert found.cost.tets != Quality.tets  # that of a mesh of the wanted size, roughly

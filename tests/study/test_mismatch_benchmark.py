@@ -15,6 +15,7 @@ FOLDER = Path(__file__).parents[2] / "benchmarks"
 
 
 def loaded(name):
+    """A module of benchmarks/, which is no package; the modules that it imports are loaded before it."""
     spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
@@ -23,15 +24,20 @@ def loaded(name):
 
 
 @pytest.fixture(scope="module")
+def rows():
+    return loaded("rows")
+
+
+@pytest.fixture(scope="module")
 def scenes():
-    module = loaded("mismatch_scenes")
+    module = loaded("scenes")
     module.TRUTH_EDGE_MM = 11.0
     return module
 
 
 @pytest.fixture(scope="module")
-def mismatch(scenes):
-    assert scenes.__name__ in sys.modules  # which it imports by that name
+def mismatch(scenes, rows):
+    assert {scenes.__name__, rows.__name__} <= sys.modules.keys()
     return loaded("mismatch")
 
 
@@ -62,7 +68,7 @@ def test_an_open_end_holds_and_no_interval_is_not_counted(mismatch):
     row = mismatch.summary_of([*cases, {"seed": 9, "error": "GeometryError: why"}])
     assert row["interval95_holds"] == {"share": 1.0, "intervals": 1}
     assert row["errors"] == ["9: GeometryError: why"]
-    assert "4 (1)" in mismatch.table_of({"still": row})
+    assert mismatch.COLUMNS["cases (errors)"](row) == "4 (1)"
 
 
 def test_truths_that_lie_outside_by_two_half_widths_are_counted_by_verdict(mismatch):
@@ -72,12 +78,33 @@ def test_truths_that_lie_outside_by_two_half_widths_are_counted_by_verdict(misma
     assert (row["out"], row["out_identified"]) == (2, 1)
 
 
-def test_a_line_that_was_cut_off_is_computed_anew(mismatch, tmp_path):
+def test_a_line_that_was_cut_off_is_computed_anew(rows, tmp_path):
     file, line = tmp_path / "lines.jsonl", {"scene": "still", "seed": 1, "law": "linear", "noise_mm": 0.0, "set": []}
-    mismatch.append_line(file, line)
+    rows.append_line(file, line)
     file.write_text(file.read_text() + '{"scene": "cro')
-    mismatch.append_line(file, line | {"seed": 2})
-    assert sorted(key[1] for key in mismatch.read_lines(file)) == [1, 2]
+    rows.append_line(file, line | {"seed": 2})
+    assert [found["seed"] for found in rows.read_lines(file)] == [1, 2]
+
+
+def test_a_job_is_run_once_and_lines_of_another_commit_are_compared(rows, tmp_path, capsys):
+    def asked(*more):
+        """The options of a campaign of two seeds."""
+        parser = rows.parser_of("A campaign.", output=str(tmp_path / "lines.jsonl"), first_seed=5, seeds=2)
+        return parser.parse_args(more)
+
+    def jobs(options, value):
+        return [rows.Job({"seed": seed}, lambda seed=seed: {"x": value * seed}) for seed in rows.seeds_of(options)]
+
+    first = rows.collected(jobs(asked(), 1.0), asked(), ("seed",))
+    assert (
+        first
+        == rows.collected(jobs(asked(), 2.0), asked(), ("seed",))
+        == [{"seed": 5, "x": 5.0}, {"seed": 6, "x": 6.0}]
+    )
+    (tmp_path / "lines.jsonl").rename(tmp_path / "before.jsonl")
+    options = asked("--share", "1/2", "--against", str(tmp_path / "before.jsonl"))
+    assert rows.collected(jobs(options, 2.0), options, ("seed",)) == [{"seed": 6, "x": 12.0}]
+    assert "x: 6.0 -> 12.0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", ["crop", "all", "fov"])

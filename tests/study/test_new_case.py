@@ -49,8 +49,21 @@ def image(names=None, **options) -> LabelImage:
 def folder(tmp_path):
     write_label_image(tmp_path / "b.nii.gz", image())
     write_label_image(tmp_path / "a.nii.gz", image(filled=True))
-    (tmp_path / "names.json").write_text(json.dumps({str(k): v for k, v in NAMES.items()}))
+    write_names(tmp_path, NAMES)
     return tmp_path
+
+
+def write_names(folder, names):
+    (folder / "names.json").write_text(json.dumps({str(number): name for number, name in names.items()}))
+
+
+def case_of(folder, names=None, *cts):
+    """The new case of the images in a folder, which is written there, too."""
+    if names is not None:
+        write_names(folder, names)
+    case = new_case(CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json", cts), folder)
+    (folder / "case.toml").write_text(case.text)
+    return case
 
 
 def test_roles_follow_from_names_in_the_order_that_a_case_needs():
@@ -118,19 +131,15 @@ def test_the_case_is_read_by_its_reader_with_paths_that_lead_to_the_images(folde
 
 
 def test_what_cannot_be_guessed_is_asked_for_and_then_refused_by_its_key(folder):
-    (folder / "names.json").write_text(json.dumps({"1": "prostate", "3": "rectum", "2": "structure x", "9": "body"}))
-    images = CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json")
-    case = new_case(images, folder)
+    case = case_of(folder, {1: "prostate", 3: "rectum", 2: "structure x", 9: "body"})
     assert any('tissues."structure x"' in question for question in case.questions)
-    (folder / "case.toml").write_text(case.text)
     with pytest.raises(ConfigurationError, match=r"the key 'role' is missing in \[tissues.structure x\]"):
         read_case(folder / "case.toml")
 
 
 def test_a_case_without_a_driver_asks_for_one(folder):
-    (folder / "names.json").write_text(json.dumps({"1": "prostate", "3": "vein", "2": "bladder", "9": "body"}))
-    images = CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json")
-    assert any("nothing was found that moves" in question for question in new_case(images, folder).questions)
+    case = case_of(folder, {1: "prostate", 3: "vein", 2: "bladder", 9: "body"})
+    assert any("nothing was found that moves" in question for question in case.questions)
 
 
 def test_another_case_is_never_replaced(folder, capsys):
@@ -154,12 +163,10 @@ def test_one_image_is_not_enough(folder, capsys):
 
 
 def test_names_that_toml_could_stumble_over_survive(folder):
-    names = {"1": 'prostate "x" # [a]', "3": "rectum\\", "9": "body", "2": "bladder = 3"}
-    (folder / "names.json").write_text(json.dumps(names))
-    images = CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json")
-    (folder / "case.toml").write_text(new_case(images, folder).text)
+    names = {1: 'prostate "x" # [a]', 3: "rectum\\", 9: "body", 2: "bladder = 3"}
+    case_of(folder, names)
     tissues = read_case(folder / "case.toml").tissues
-    assert {tissue.name for tissue in tissues} >= {names["1"], names["2"], names["3"]}
+    assert {tissue.name for tissue in tissues} >= {names[1], names[2], names[3]}
 
 
 def write_ct(path, labels_shown, *, inside=40.0, outside=-1000.0):
@@ -176,18 +183,12 @@ def bodiless(tmp_path):
         array = labels(filled=filled)
         write_ct(tmp_path / f"{name}_ct.nii.gz", array)
         write_label_image(tmp_path / f"{name}.nii.gz", LabelImage(np.where(array == 9, 0, array), GRID))
-    (tmp_path / "names.json").write_text(json.dumps({str(k): v for k, v in NAMES.items() if k != 9}))
+    write_names(tmp_path, {number: name for number, name in NAMES.items() if number != 9})
     return tmp_path
 
 
-def bodiless_case(folder, *cts):
-    images = CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json", cts)
-    return new_case(images, folder)
-
-
 def test_what_a_ct_shows_to_be_air_is_void_and_the_rest_of_label_0_is_tissue(bodiless):
-    case = bodiless_case(bodiless, bodiless / "b_ct.nii.gz", bodiless / "a_ct.nii.gz")
-    (bodiless / "case.toml").write_text(case.text)
+    case = case_of(bodiless, None, bodiless / "b_ct.nii.gz", bodiless / "a_ct.nii.gz")
     read = read_case(bodiless / "case.toml")
     for path, filled in ((read.images.before, False), (read.images.after[0], True)):
         found = read_segmentation(read, path, read_label_table(read.images.names), None)
@@ -204,7 +205,7 @@ def test_what_a_ct_shows_to_be_air_is_void_and_the_rest_of_label_0_is_tissue(bod
 def test_without_a_ct_the_case_says_how_much_of_label_0_no_label_tells_from_air(bodiless, ct):
     if ct is not None:  # an MR image shows no air in Hounsfield units
         write_ct(bodiless / "mr.nii.gz", labels(), **ct)
-    case = bodiless_case(bodiless, *([bodiless / "mr.nii.gz"] if ct else []))
+    case = case_of(bodiless, None, *([bodiless / "mr.nii.gz"] if ct else []))
     shown = np.argwhere(np.isin(labels(), [1, 2, 3, 4, 5, 6]))
     low, high = shown.min(axis=0), shown.max(axis=0)
     within = np.prod(high - low + 1) / labels().size  # the hull is smaller than the box around the labels
@@ -220,7 +221,7 @@ def test_in_an_image_wider_than_a_body_air_is_asked_for(bodiless):
     for name, filled in (("b", False), ("a", True)):
         array = labels(filled=filled)
         write_label_image(bodiless / f"{name}.nii.gz", LabelImage(np.where(array == 9, 0, array), wide))
-    assert [question for question in bodiless_case(bodiless).questions if "label 0" in question]
+    assert [question for question in case_of(bodiless).questions if "label 0" in question]
 
 
 def test_a_background_without_a_body_is_no_air():
@@ -232,7 +233,6 @@ def test_a_background_without_a_body_is_no_air():
 
 def test_the_proposed_mesh_fits_the_memory_of_the_machine(folder, environment):
     has_gb = 1.0
-    images = CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json")
 
     def edge_and_memory(text):
         (folder / "case.toml").write_text(text)
@@ -243,9 +243,9 @@ def test_the_proposed_mesh_fits_the_memory_of_the_machine(folder, environment):
         states = read_states(case)
         return check.memory_problems(expected_cost(case, states.before, states.after, n_pairs=1))
 
-    roomy, _ = edge_and_memory(new_case(images, folder).text)
+    roomy, _ = edge_and_memory(case_of(folder).text)
     environment(PALPATE_MEMORY_GB=f"{has_gb:g}")
-    text = new_case(images, folder).text
+    text = case_of(folder).text
     edge, problems = edge_and_memory(text)
     assert edge > roomy
     assert problems == []
@@ -258,9 +258,7 @@ COLON = {1: "prostate", 2: "urinary_bladder", 3: "colon", 4: "femur_left", 9: "b
 
 
 def test_without_a_rectum_the_colon_near_an_organ_of_the_pelvis_is_offered_as_driver(folder):
-    (folder / "names.json").write_text(json.dumps({str(k): v for k, v in COLON.items()}))
-    case = new_case(CaseImages(folder / "b.nii.gz", (folder / "a.nii.gz",), folder / "names.json"), folder)
-    (folder / "case.toml").write_text(case.text)
+    case = case_of(folder, COLON)
     roles = {tissue.name: tissue.role for tissue in read_case(folder / "case.toml").tissues}
     assert roles["colon"] is Role.DRIVER
     (question,) = case.questions

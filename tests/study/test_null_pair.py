@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import palpate
+from case_texts import ORGAN, REST, case_text
 from palpate.cli import main
 from palpate.errors import InputDataError
 from palpate.images.label_image import LabelImage, VoxelGrid
@@ -103,15 +104,7 @@ def test_the_command_prints_blocks_that_a_case_takes(tmp_path, capsys):
     assert blocks["discrepancy"] == pytest.approx(document["discrepancy"], rel=0.05)
     assert main(["noise", *map(str, paths)]) == 0
     assert document["toml"] in capsys.readouterr().out
-    case = """
-[images]
-before = "a.nii.gz"
-after = ["b.nii.gz"]
-[tissues]
-ball = { label = 1, role = "estimate" }
-rest = { label = "remaining", role = "known", youngs_modulus_kpa = 3.0 }
-"""
-    (tmp_path / "case.toml").write_text(case + document["toml"])
+    (tmp_path / "case.toml").write_text(case_text({"ball": ORGAN, "rest": REST}) + document["toml"])
     read = palpate.read_case(tmp_path / "case.toml")
     assert read.noise.surface_sd_mm == pytest.approx(document["noise"]["surface_sd_mm"], rel=0.01)
     assert palpate.noise(*paths).to_dict() == document

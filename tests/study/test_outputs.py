@@ -14,7 +14,7 @@ import pytest
 
 from children import in_a_child
 from palpate.errors import ResourceError
-from palpate.study.outputs import AREA, EARLIER, OutputFolder, make_folder, sha256_of, write_json
+from palpate.study.outputs import AREA, EARLIER, OutputFolder, sha256_of, write_json
 
 NAMES = {"old": ("mesh.vtu", "report.html", "surfaces/a"), "new": ("mesh.vtu", "report.html", "surfaces/b")}
 CHANGES = ((Path, "replace"), (Path, "unlink"), (os, "link"), (os, "fsync"), (os, "rmdir"))  # of names, and to the disk
@@ -159,12 +159,6 @@ def test_files_of_a_block_that_is_left_early_are_gone(tmp_path, whole):
         broken_off(ZeroDivisionError())
     assert state(tmp_path, whole) == "old"
     assert not (tmp_path / AREA).exists()
-
-
-def test_a_folder_that_cannot_be_made_is_a_resource_error(tmp_path):
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(ResourceError, match="choose another --output"):
-        make_folder(tmp_path / "file" / "below")
 
 
 def test_json_refuses_what_is_not_json(tmp_path):

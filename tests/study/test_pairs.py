@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from case_texts import BALLS, case_text
 from palpate.body.read import read_pairs
 from palpate.case.file import read_case
 from palpate.cli import main
@@ -14,30 +15,8 @@ from palpate.errors import ConfigurationError
 from palpate.images.readers import write_label_image
 from scenes import coarse_balls
 
-CASE = """
-[images]
-before = "before_2.nii.gz"
-after = ["after.nii.gz"]
-
-[tissues.core]
-label = 1
-role = "estimate"
-youngs_modulus_kpa = 60.0
-
-[tissues.shell]
-label = 2
-role = "estimate"
-youngs_modulus_kpa = 30.0
-
-[tissues.frame]
-label = 3
-role = "driver"
-
-[tissues.surroundings]
-label = "remaining"
-role = "known"
-youngs_modulus_kpa = 10.0
-"""
+TISSUES = BALLS | {name: BALLS[name] | {"youngs_modulus_kpa": kpa} for name, kpa in (("core", 60.0), ("shell", 30.0))}
+CASE = case_text(TISSUES, before="before_2.nii.gz")
 COARSE = [
     *("mechanics.law=linear", "mechanics.element=P1", "mesh.edge_length_mm=8", "driver.modes=12"),
     *("estimate.start_ratios=[3.0]", "estimate.samples=100", "discrepancy.layer_sd=0"),

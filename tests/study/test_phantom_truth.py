@@ -7,27 +7,19 @@ import inspect
 
 import pytest
 
+from case_texts import case_text
 from palpate.body import read
 from palpate.case.file import read_case
 from palpate.errors import ConfigurationError
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.phantoms.scene import make_scene
 
-CASE = """
-[phantom]
-kind = "KIND"
-[mechanics]
-law = "mooney-rivlin"
-c01_over_c10 = 1.5
-[motion]
-filling_mm = 2.5
-"""
 PELVIS, SPHERES = (importlib.import_module(f"palpate.phantoms.{name}") for name in ("pelvis", "spheres"))
 TISSUES = {
     "spheres": {
         "core": ("estimate", 70.0, 0.49),
         "surroundings": ("known", 12.0, 0.3),
-        "frame": ("driver", None, None),
+        "frame": ("driver",),
     },
     "pelvis": {"prostate": ("estimate", 80.0, 0.49), "surroundings": ("known", 9.0, 0.3)},
 }
@@ -48,12 +40,19 @@ def asked(monkeypatch):
 
 
 def case_of(tmp_path, kind: str, *overrides: str):
-    lines = [CASE.replace("KIND", kind)]
-    for name, (role, modulus, ratio) in TISSUES[kind].items():
-        stated = {"role": f'"{role}"', "youngs_modulus_kpa": modulus, "poisson_ratio": ratio}
-        lines += [f"[tissues.{name}]", *(f"{key} = {value}" for key, value in stated.items() if value is not None)]
+    keys = ("role", "youngs_modulus_kpa", "poisson_ratio")
+    tissues = {name: dict(zip(keys, stated, strict=False)) for name, stated in TISSUES[kind].items()}
     path = tmp_path / "case.toml"
-    path.write_text("\n".join(lines))
+    path.write_text(
+        case_text(
+            tissues,
+            before=None,
+            after=None,
+            phantom={"kind": kind},
+            mechanics={"law": "mooney-rivlin", "c01_over_c10": 1.5},
+            motion={"filling_mm": 2.5},
+        )
+    )
     return read_case(path, overrides)
 
 
@@ -61,8 +60,8 @@ def case_of(tmp_path, kind: str, *overrides: str):
 def test_moduli_poisson_ratios_and_the_laws_parameter_of_a_case_are_the_phantoms(kind, tmp_path, asked):
     read.phantom_scene(case_of(tmp_path, kind))
     truth = {t.name: (t.youngs_modulus_kpa, t.poisson_ratio) for t in asked["anatomy"].tissues}
-    for name, (_, modulus, ratio) in TISSUES[kind].items():
-        assert modulus is None or truth[name] == (modulus, ratio)
+    for name, (_, *stated) in TISSUES[kind].items():
+        assert not stated or truth[name] == tuple(stated)
     assert asked["law"] == MooneyRivlin(c01_over_c10=1.5)
 
 

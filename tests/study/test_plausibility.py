@@ -8,37 +8,11 @@ import pytest
 
 from palpate.case.case import Case
 from palpate.statement.plausibility import (
-    PUBLISHED,
     estimate_warnings,
     plausibility_warnings,
     published_for,
     unit_warnings,
 )
-
-
-def test_every_published_value_has_range_method_and_source():
-    for entry in PUBLISHED:
-        assert 0 < entry.low <= entry.high
-        assert entry.method
-        assert entry.source
-
-
-@pytest.mark.parametrize(
-    ("name", "tissue"),
-    [("Prostate", "prostate"), ("urinary_bladder", "bladder wall"), ("prostate tumour", "prostate cancer")],
-)
-def test_names_find_their_tissue(name, tissue):
-    assert {entry.tissue for entry in published_for(name)} == {tissue}
-
-
-def test_an_unknown_tissue_is_not_judged():
-    assert plausibility_warnings({"omentum": 1e6}) == ()
-
-
-@pytest.mark.parametrize("name", ["gallbladder", "gall bladder", "Gall-Bladder"])
-def test_a_gallbladder_is_no_bladder(name):
-    assert published_for(name) == ()
-    assert plausibility_warnings({name: 1e6}) == ()
 
 
 def test_a_value_within_the_published_range_is_not_warned_of():
@@ -57,17 +31,11 @@ def test_a_bladder_meshed_as_one_solid_is_not_compared_with_its_wall():
     assert [w.code for w in plausibility_warnings({"bladder wall": 20.0})] == ["implausible-stiffness"]
 
 
-@pytest.mark.parametrize(("value", "hint"), [(10000000.0, "Pa, write 10000"), (0.01, "MPa, write 10")])
-def test_units_that_slipped_are_noticed(case_result, value, hint):
-    case: Case = case_result.case
-    known = dataclasses.replace(case.tissues[3], youngs_modulus_kpa=value)
-    (warning,) = unit_warnings(dataclasses.replace(case, tissues=(*case.tissues[:3], known)))
-    assert hint in warning.message
-
-
 @pytest.mark.parametrize(
     ("name", "value", "hint"),
     [
+        ("surroundings", 1e7, "Pa, write 10000"),
+        ("surroundings", 0.01, "MPa, write 10"),
         ("surroundings", 8000.0, "8000 Pa, write 8"),
         ("fat", 2250.0, "2250 Pa, write 2.25"),
         ("muscle", 3000.0, "3000 Pa, write 3"),
@@ -76,6 +44,7 @@ def test_units_that_slipped_are_noticed(case_result, value, hint):
         ("colon wall", 5180.0, None),
         ("muscle", 280.0, None),
         ("surroundings", 2.6, None),
+        ("surroundings", 10.0, None),
     ],
 )
 def test_a_modulus_in_pascals_is_noticed_by_the_tissues_own_range(case_result, name, value, hint):
@@ -83,10 +52,6 @@ def test_a_modulus_in_pascals_is_noticed_by_the_tissues_own_range(case_result, n
     known = dataclasses.replace(case.tissues[3], name=name, youngs_modulus_kpa=value)
     warnings = unit_warnings(dataclasses.replace(case, tissues=(*case.tissues[:3], known)))
     assert [hint in warning.message for warning in warnings] == ([True] if hint else [])
-
-
-def test_usual_units_pass(case_result):
-    assert unit_warnings(case_result.case) == ()
 
 
 def test_what_did_not_converge_is_not_told_by_a_warning(case_result):
@@ -100,6 +65,9 @@ def test_what_did_not_converge_is_not_told_by_a_warning(case_result):
 @pytest.mark.parametrize(
     ("name", "tissue"),
     [
+        ("Prostate", "prostate"),
+        ("urinary_bladder", "bladder wall"),
+        ("prostate tumour", "prostate cancer"),
         ("liver_tumor", "liver tumour"),
         ("LiverTumours", "liver tumour"),
         ("breast cancer", "breast tumour"),
@@ -117,16 +85,14 @@ def test_organs_and_their_tumours_have_their_own_range(name, tissue):
     assert {entry.tissue for entry in published_for(name)} == {tissue}
 
 
-@pytest.mark.parametrize("name", ["tumour", "lesion 2", "kidney tumor", "brain_tumour", "hepatic vessel", "oesophagus"])
+@pytest.mark.parametrize(
+    "name",
+    ["omentum", "gallbladder", "gall bladder", "Gall-Bladder", "tumour", "lesion 2", "kidney tumor", "brain_tumour",
+     "hepatic vessel", "oesophagus"],
+)  # fmt: skip
 def test_what_nobody_published_is_not_judged(name):
+    assert published_for(name) == ()
     assert plausibility_warnings({name: 1e6}) == ()
-
-
-def test_every_warning_has_two_sentences_and_sixty_words_at_most():
-    for entry in PUBLISHED:
-        name = f"{entry.words.split()[0]} {'tumour' if entry.tumour else 'wall'}"
-        for warning in plausibility_warnings({name: 1e6}):
-            assert len(warning.message.split()) <= 60, warning.message
 
 
 @pytest.mark.parametrize(

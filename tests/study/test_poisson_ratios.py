@@ -7,12 +7,12 @@ import json
 from dataclasses import replace
 
 import jsonschema
-import meshio
 import numpy as np
 import pytest
 import referencing
 
-from bodies import box_cells
+from bodies import BAR_MM, with_first_pair, write_bar
+from case_texts import BALLS, LINEAR, case_text
 from palpate.body.poisson_ratios import (
     PoissonRatioEstimate,
     eta_of_ratio,
@@ -37,47 +37,14 @@ from palpate.study.sensitivity import sensitivity
 from palpate.uncertainty import Covariance
 from scenes import coarse_balls
 
-CASE = """
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-
-[tissues.core]
-label = 1
-role = "estimate"
-
-[tissues.shell]
-label = 2
-role = "estimate"
-poisson_ratio = 0.4
-poisson_ratio_sd = 0.01
-
-[tissues.frame]
-label = 3
-role = "driver"
-
-[tissues.surroundings]
-label = "remaining"
-role = "known"
-youngs_modulus_kpa = 10.0
-
-[mechanics]
-law = "linear"
-element = "P1"
-
-[mesh]
-edge_length_mm = 12.0
-
-[driver]
-modes = 8
-
-[discrepancy]
-layer_sd = 0.0
-
-[estimate]
-parameters = ["youngs_modulus", "poisson_ratio"]
-start_ratios = [3.0]
-"""
+CASE = case_text(
+    BALLS | {"shell": BALLS["shell"] | {"poisson_ratio": 0.4, "poisson_ratio_sd": 0.01}},
+    mechanics=LINEAR,
+    mesh={"edge_length_mm": 12.0},
+    driver={"modes": 8},
+    discrepancy={"layer_sd": 0.0},
+    estimate={"parameters": ["youngs_modulus", "poisson_ratio"], "start_ratios": [3.0]},
+)
 BAR = """
 surfaces = [{{ name = "floor", where = "z_min" }}, {{ name = "grip", where = "z_max" }}]
 body.mesh = "bar.vtu"
@@ -123,7 +90,7 @@ def with_ratio(case_result):
     every = Covariance(noise, *np.zeros((3, *noise.shape)), noise)
     estimation = replace(estimation, poisson_ratios=(found,), covariance=every.of_first(2), with_ratios=every)
     space = with_ratios(case_result.space, estimation.found_ratios)
-    return replace(case_result, case=seeking(case_result.case), estimation=estimation, space=space)
+    return with_first_pair(replace(case_result, case=seeking(case_result.case), estimation=estimation), space=space)
 
 
 def test_the_result_states_moduli_then_ratios_with_their_verdict(outputs):
@@ -153,15 +120,9 @@ def test_the_result_states_moduli_then_ratios_with_their_verdict(outputs):
 @pytest.mark.parametrize("given", [0.2, 0.45, 0.49])
 def test_a_bar_that_narrows_tells_its_ratio_under_every_law(tmp_path, given, law):
     """Of half a per cent of strain, where all laws are one: by Hooke's law, wherever the search begins."""
-    size, strain, ratio, modulus = np.array([20.0, 20.0, 30.0]), 0.005, 0.3, 50.0
-    nodes, tets = box_cells((4, 4, 6), size)
-    meshio.write(tmp_path / "bar.vtu", meshio.Mesh(nodes, [("tetra", tets)]))
-    rng = np.random.default_rng(1)
-    points = rng.uniform(0.5, size - 0.5, (300, 3))
-    moved = strain * points * np.array([-ratio, -ratio, 1.0]) + 0.01 * rng.standard_normal((300, 3))
-    head = "before_x,before_y,before_z,after_x,after_y,after_z"
-    np.savetxt(tmp_path / "field.csv", np.c_[points, points + moved], delimiter=",", header=head, comments="")
-    newtons = 1e-3 * modulus * size[0] * size[1] * strain
+    strain, ratio, modulus = 0.005, 0.3, 50.0
+    write_bar(tmp_path, strain=strain, ratio=ratio)
+    newtons = 1e-3 * modulus * BAR_MM[0] * BAR_MM[1] * strain
     (tmp_path / "case.toml").write_text(BAR.format(given=given, law=law, newtons=newtons, sd=0.01 * newtons))
     found = estimate(read_case(tmp_path / "case.toml")).estimation
     (bar,), (nu,) = found.estimates, found.poisson_ratios

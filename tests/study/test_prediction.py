@@ -14,16 +14,13 @@ from palpate.body.imaged import aligned
 from palpate.case.case import Case, CaseTissue, Discrepancy, DriverMotion, Images, Mechanics, MeshSettings, Noise
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
+from palpate.progress import silent
 from palpate.study.prediction import predicted_intervals
 from palpate.study.run import estimate_states
 from palpate.uncertainty import NORMAL_95
 from scenes import coarse_balls
 
 GIVEN = {"core": 60.0, "shell": 30.0}
-
-
-def silent(_: str) -> None:
-    """Nobody listens."""
 
 
 def case_of(scene, **changes):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from case_texts import ORGAN, case_text
 from palpate.case.case import Case, CaseTissue
 from palpate.case.file import read_case
 from palpate.case.schema import Rule, rule
@@ -16,12 +17,7 @@ from palpate.errors import ConfigurationError
 from palpate.images.named_labels import MAX_LABEL
 
 PAGE = Path(__file__).parents[2] / "docs" / "case-file.md"
-CASE = """
-images = { before = "before.nii.gz", after = ["after.nii.gz"] }
-[tissues.prostate]
-label = 1
-role = "estimate"
-"""
+CASE = case_text({"prostate": ORGAN})
 NEEDED = {
     "sd_mm": 'data=[{kind="landmarks", file="m.csv", sd_mm=VALUE}]',
     "force_n": 'data=[{kind="force", surface="outer", direction=[0, 0, 1.0], sd_n=1.0, force_n=VALUE}]',
@@ -59,11 +55,6 @@ def numbers(kind: type, where: str = ""):
 
 
 NUMBERS = dict(numbers(Case))
-
-
-def test_the_walk_finds_the_numbers():
-    assert {"seed", "stage", "mesh.edge_length_mm", "tissues.*.poisson_ratio", "estimate.bounds_kpa"} <= set(NUMBERS)
-    assert len(NUMBERS) > 20
 
 
 @pytest.mark.parametrize("place", NUMBERS)

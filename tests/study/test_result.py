@@ -8,37 +8,25 @@ import json
 import numpy as np
 import pytest
 
-from palpate.body.provenance import input_digests, software_versions
+from palpate.body.provenance import input_digests
 from palpate.errors import InputDataError, NotConverged, SolverError
 from palpate.images.tissue import Role
 from palpate.report.collect import collect_failure
 from palpate.statement.result import MeshResult, Simulation, failure_document
 from palpate.uncertainty import Covariance
 
-KEYS = {
-    "schema", "id", "status", "reason", "law", "element", "method", "estimates", "correlation", "fit", "starts",
-    "counts", "mesh", "seconds", "inputs", "versions", "seed", "warnings",
-}  # fmt: skip
-ESTIMATE_KEYS = {
-    "tissue", "parameter", "unit", "value", "interval95", "interval_kind", "relative_to", "ratio", "ratio_interval95",
-    "verdict", "why", "truth", "variance_shares", "profile",
-}  # fmt: skip
-
 
 def with_estimation(result, **changes):
     return dataclasses.replace(result, estimation=dataclasses.replace(result.estimation, **changes))
 
 
-def test_the_document_has_the_fixed_keys(case_result):
+def test_the_document_says_what_was_found(case_result):
     document = case_result.to_dict()
     assert document["schema"] == "palpate.result/1"
-    assert set(document) >= KEYS
-    assert set(document["estimates"][0]) >= ESTIMATE_KEYS
     assert document["estimates"][0]["interval95"] == pytest.approx([47.12, 73.625])
     assert set(document["fit"][0]) == {"after", "prostate", "bladder"}
     assert document["fit"][0]["after"] == "after.nii.gz"
     assert document["fit"][0]["prostate"]["end"]["hd95_mm"] == 0.22
-    assert set(document["starts"][0]) >= {"start", "end", "objective_mm2", "status", "reason", "iterations"}
     assert document["starts"][0]["reason"] == "ok"
     assert document["observations"] == {"surface distance": "the distance between surfaces"}
     assert document["inputs"]["before"] == {"sha256": "ab" * 32}
@@ -67,10 +55,8 @@ def test_what_did_not_converge_has_no_value(case_result, status):
 @pytest.mark.parametrize(("error", "status"), [(NotConverged("x"), "not converged"), (SolverError("y"), "failed")])
 def test_an_error_still_makes_a_whole_document(case_result, error, status):
     document = failure_document(case_result.case, error)
-    assert set(document) >= KEYS
     assert (document["status"], document["reason"]) == (status, str(error))
     assert [(e["tissue"], e["value"]) for e in document["estimates"]] == [("prostate", None), ("bladder", None)]
-    assert set(document["estimates"][0]) >= ESTIMATE_KEYS
 
 
 def test_a_failed_estimate_without_anything_known_speaks_of_ratios(case_result):
@@ -107,7 +93,3 @@ def test_digests_name_every_input_and_a_file_that_changed_between_two_readings_i
     assert digests == {"before": "1", "names": "2", "pairs[0].before": "3", "intensities_before": abc}
     with pytest.raises(InputDataError, match="'names' was changed"):
         input_digests(case, {"names": "1"}, {"names": "2"})
-
-
-def test_versions_name_python_and_palpate():
-    assert {"python", "palpate", "numpy"} <= set(software_versions())

@@ -11,6 +11,7 @@ import pytest
 import referencing
 
 import palpate
+from case_texts import LINEAR, ORGAN, REST, case_text
 from palpate.body.body import joint_problem, make_body
 from palpate.body.read import read_states
 from palpate.case.file import read_case
@@ -23,51 +24,21 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.progress import silent
 from palpate.report.tornado import effect_text, sensitivity_page, sensitivity_table, tornado_rows
 from palpate.statement.variations import fast_variations
-from palpate.study import invert_case as inverted_module
+from palpate.study import case_inversion
 from palpate.study import sensitivity as study
 from palpate.study.case_inversion import invert_case
 from palpate.study.run import inversion_settings
 from palpate.unknowns import Choice
 
-CASE = """
-[images]
-before = "before.nii.gz"
-after = ["after.nii.gz"]
-
-[tissues."gland <b>"]
-label = 1
-role = "estimate"
-
-[tissues.tube]
-label = 3
-role = "driver"
-
-[tissues.rest]
-label = [2, 4]
-role = "known"
-youngs_modulus_kpa = 10.0
-
-[mechanics]
-law = "linear"
-element = "P1"
-
-[mesh]
-edge_length_mm = 7.0
-
-[driver]
-modes = 8
-
-[domain]
-outer_boundary = "fixed"
-
-[discrepancy]
-heterogeneity_sd = 0.0
-poisson_sd = 0.0
-surface_offset_mm = 0.0
-
-[estimate]
-start_ratios = [3.0]
-"""
+CASE = case_text(
+    {"gland <b>": ORGAN, "tube": {"label": 3, "role": "driver"}, "rest": REST | {"label": [2, 4]}},
+    mechanics=LINEAR,
+    mesh={"edge_length_mm": 7.0},
+    driver={"modes": 8},
+    domain={"outer_boundary": "fixed"},
+    discrepancy={"heterogeneity_sd": 0.0, "poisson_sd": 0.0, "surface_offset_mm": 0.0},
+    estimate={"start_ratios": [3.0]},
+)
 GLAND = "gland <b>"
 
 
@@ -86,7 +57,7 @@ def interrupted(case_file, tmp_path_factory):
 
     Of the variants two are left; that under a law without equilibrium is refused.
     """
-    folder, told, real = tmp_path_factory.mktemp("out"), [], inverted_module.invert
+    folder, told, real = tmp_path_factory.mktemp("out"), [], case_inversion.invert
     case = read_case(case_file)
     calls = []
 
@@ -108,7 +79,7 @@ def interrupted(case_file, tmp_path_factory):
     ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, "variants_of", lambda *_: iter(few))
-        patch.setattr(inverted_module, "invert", again)
+        patch.setattr(case_inversion, "invert", again)
         with pytest.raises(KeyboardInterrupt):
             palpate.sensitivity(case, output=folder)
         before = len(calls)

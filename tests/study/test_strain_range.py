@@ -67,7 +67,7 @@ def test_nothing_fitted_is_nothing_strained(space):
 def test_every_pair_of_images_meets_its_own_mesh_and_displacements(case_result):
     r = case_result
     case = dataclasses.replace(r.case, mechanics=Mechanics(law="linear"))
-    body = Body(ImagedStates(r.before, r.after, ({},), ()), r.space, None, 1.0)
+    body = Body(ImagedStates(r.before, r.pairs[0].later), r.space, None, 1.0)
     small = dataclasses.replace(r.space, mesh=dataclasses.replace(r.space.mesh, nodes=0.5 * r.space.mesh.nodes))
     half = dataclasses.replace(body, space=small)
     motion = stretched(r.space, 0.08)  # on the mesh of half the size it strains twice as much

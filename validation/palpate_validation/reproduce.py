@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from palpate.errors import ConfigurationError
-from palpate_validation.paper.cohort import CohortSettings
 from palpate_validation.paper.figure4 import Figure4Settings, figure4
-from palpate_validation.paper.staging import staging
+from palpate_validation.paper.staging import CohortSettings, staging
 from palpate_validation.paper.table1 import Table1Settings, table1
 from palpate_validation.paper.table2 import Table2Settings, table2
 from palpate_validation.scenes import Found, Progress, Scenes

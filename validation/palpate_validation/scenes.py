@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import json
 import os
-import signal
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
-from multiprocessing import connection, get_context
-from multiprocessing.connection import Connection
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -31,7 +31,6 @@ Part = Any  # of JSON
 Progress = Callable[[str], None]
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-GRACE = 5.0  # seconds that an ended process has to go
 
 
 class Found(Protocol):
@@ -141,81 +140,49 @@ class Ledger:
 def compute(jobs: Sequence[Job], ledger: Ledger, *, workers: int, progress: Progress) -> dict[str, Part]:
     """All parts by key: from the ledger, or made by `workers` processes (1: by this one) and written into it.
 
-    Raises what a part raises, and `ResourceError` when a process ends without a word.
+    What a process says comes when its job is done. Raises what a part raises, and `ResourceError` when a process ends
+    without a word.
     """
     parts = ledger.finished()
     left = [Job(keys, job.make) for job in jobs if (keys := tuple(key for key in job.keys if key not in parts))]
     total, count = sum(len(job.keys) for job in jobs), sum(len(job.keys) for job in left)
     if count < total:
         progress(Line(f"{total - count} of {total} parts are already computed"))
-    made = ((key, job.make(key, progress)) for job in left for key in job.keys)
+    made: Iterator[tuple[str, Part]] = ((key, _kept(job, key, ledger, progress)) for job in left for key in job.keys)
     if min(workers, len(left)) > 1:
-        made = _made_by(left, workers, progress)
+        made = _made_by(left, ledger, min(workers, len(left)), progress)
     for done, (key, part) in enumerate(made, start=total - count + 1):
-        parts[key] = ledger.keep(key, part)
+        parts[key] = part
         progress(Line(f"part {done} of {total} done: {key}"))
     return parts
 
 
-def _made_by(jobs: Sequence[Job], workers: int, progress: Progress) -> Generator[tuple[str, Part]]:
-    context = get_context("spawn")
-    waiting = list(jobs)
-    pipes = [context.Pipe() for _ in range(min(workers, len(jobs)))]
-    processes = [context.Process(target=_work, args=(theirs,), daemon=True) for _, theirs in pipes]
-    try:
-        with _threads(max(1, processors() // len(pipes))):
-            for process in processes:
-                process.start()
-        for _, theirs in pipes:
-            theirs.close()
-        busy = [ours for ours, _ in pipes]
-        while busy:
-            for pipe in connection.wait(busy):
-                assert isinstance(pipe, Connection)
-                yield from _heard(pipe, waiting, busy, progress)
-    finally:
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.join(GRACE)
+def _kept(job: Job, key: str, ledger: Ledger, progress: Progress) -> Part:
+    return ledger.keep(key, job.make(key, progress))
 
 
-def _heard(
-    pipe: Connection, waiting: list[Job], busy: list[Connection], progress: Progress
-) -> Iterator[tuple[str, Part]]:
-    """Take one message of a worker: the part in it, if it is one; the worker's next job, if it asks for it."""
-    try:
-        kind, content = pipe.recv()
-    except EOFError as error:
-        raise ResourceError(
-            "a process of the experiment ended before its part was done, most likely for want of memory; the same"
-            " command goes on with the parts that are left"
-        ) from error
-    if kind == "part":
-        yield content
-    elif kind == "progress":
-        progress(content)
-    elif kind == "error":
-        raise content
-    elif waiting:
-        pipe.send(waiting.pop(0))
-    else:
-        pipe.send(None)
-        busy.remove(pipe)
-
-
-def _work(pipe: Connection) -> None:
-    """A worker process: asks for jobs until there are none."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started this one ends it
-    with suppress(BrokenPipeError, EOFError):
+def _made_by(jobs: Sequence[Job], ledger: Ledger, workers: int, progress: Progress) -> Iterator[tuple[str, Part]]:
+    with _threads(max(1, processors() // workers)), ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        waiting = [pool.submit(_job, job, ledger) for job in jobs]
         try:
-            pipe.send(("ready", None))
-            while (job := pipe.recv()) is not None:
-                for key in job.keys:
-                    pipe.send(("part", (key, job.make(key, lambda text: pipe.send(("progress", text))))))
-                pipe.send(("ready", None))
-        except Exception as error:  # raised again where the experiment was asked for
-            pipe.send(("error", error))
+            for future in as_completed(waiting):
+                said, parts = future.result()
+                for text in said:
+                    progress(text)
+                yield from parts.items()
+        except BrokenProcessPool as error:
+            raise ResourceError(
+                "a process of the experiment ended before its part was done, most likely for want of memory; the same"
+                " command goes on with the parts that are left"
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _job(job: Job, ledger: Ledger) -> tuple[list[str], dict[str, Part]]:
+    """In a process of its own: what was said, and the parts of a job, each kept as soon as it is made."""
+    said = list[str]()
+    return said, {key: _kept(job, key, ledger, said.append) for key in job.keys}
 
 
 @contextmanager
@@ -226,8 +193,6 @@ def _threads(number: int) -> Iterator[None]:
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in THREADS:
+            del os.environ[name]
+        os.environ.update({name: value for name, value in before.items() if value is not None})

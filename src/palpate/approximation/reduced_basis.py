@@ -26,10 +26,10 @@ FAR = 30.0  # largest over smallest ratio of moduli to the factorised ones, beyo
 FAR_ALONE = 300.0  # the same for a single right-hand side, which takes some 4 sqrt(spread) iterations
 SNAPSHOT = 1e-5  # relative residual of basis vectors; their error is measured, and corrected, at each place
 DISPLACEMENT, TANGENT = 3e-4, 1e-2  # of the reduced model's error, that a correction may leave
-STALE = 1.0  # change of ln E after which all responses to the material modes are made anew
+REMADE_AFTER = 1.0  # change of ln E after which all responses to the material modes are made anew
 ITERATIONS = 3.0, 5.0  # of conjugate gradients: at least, and for each unit of sqrt(spread) - 1 of moduli's ratios
 MAKING = 2.5e-5  # seconds an unknown that a factorisation takes beside elimination: its matrix, and its probes
-FAR_OFF = 3e-3  # missing share of the displacement, below which derivatives are wrong by as small a share
+MISSING = 3e-3  # share of the displacement, below which derivatives are wrong by as small a share
 MAX_ITERATIONS = 120
 FEW = 12  # right-hand sides, of which an iteration takes no less time: the factor is read once
 TOGETHER = 64  # right-hand sides of several states that are solved for together
@@ -144,13 +144,13 @@ class ReducedBasis:
         assert self.place is not None, "a basis is at a place once it is made exact there"
         return replace(self, projection=self.projection.at_displacement(self.homogeneous(self.place)))
 
-    def stale(self, at: LinearisationPoint) -> bool:
+    def lacks_material(self, at: LinearisationPoint) -> bool:
         """Whether responses to the material modes are not there yet, or of far from a place that asks for them all."""
         if not self.full_model.material.n_modes:
             return False
         if not len(self.material_at):
             return True
-        return at.all_material and bool(np.abs(np.log(at.moduli / self.material_at)).max() > STALE)
+        return at.all_material and bool(np.abs(np.log(at.moduli / self.material_at)).max() > REMADE_AFTER)
 
     def homogeneous(self, at: LinearisationPoint) -> NDArray[np.float64]:
         """The displacement (n_dof,) mm at a place as it would be of homogeneous tissues."""
@@ -212,7 +212,7 @@ class _Missing:
     @classmethod
     def of(cls, basis: ReducedBasis, at: LinearisationPoint) -> _Missing:
         """What it is of a basis at a place."""
-        model, every = basis.full_model, at.directions is not None and basis.stale(at)
+        model, every = basis.full_model, at.directions is not None and basis.lacks_material(at)
         first, size = len(at.moduli) + model.constraint.n_modes, len(at.moduli) + model.n_modes
         along = np.zeros((size, 0))
         if every and at.directions is not None:
@@ -257,7 +257,7 @@ class _Missing:
         """
         model, n = self.basis.full_model, len(self.at.moduli)
         late = np.asarray(model.constraint.free @ missing[:, : self.new])
-        if not self.along.shape[1] or np.linalg.norm(late) <= FAR_OFF * np.linalg.norm(self.displacement):
+        if not self.along.shape[1] or np.linalg.norm(late) <= MISSING * np.linalg.norm(self.displacement):
             return missing[:, :0]
         boundary = self.along[: n + model.constraint.n_modes].copy()
         boundary[n:] = 0.0  # what boundary modes do does not depend on the displacement

@@ -10,12 +10,9 @@ if TYPE_CHECKING:
     from palpate.body.body import Body as Body
     from palpate.body.body import inverse_problem as inverse_problem
     from palpate.body.body import make_body as make_body
-    from palpate.body.cost import ExpectedCost as ExpectedCost
-    from palpate.body.cost import expected_cost as expected_cost
     from palpate.body.edge_length import edge_length_of as edge_length_of
     from palpate.body.imaged import ImagedStates as ImagedStates
     from palpate.body.imaged import aligned as aligned
-    from palpate.body.loads import loads_on as loads_on
     from palpate.body.provenance import software_versions as software_versions
     from palpate.body.read import read_states as read_states
 

@@ -21,6 +21,7 @@ from palpate.images.named_labels import printable
 MOST_LETTERS = 4096  # of a text: the longest path that systems take
 MOST_SHOWN = 80  # letters of a text in a sentence
 MOST_OTHERS = 15  # known names that a hint lists
+MOST_TABLES = 15  # that lack the same key, by name
 MOST_COMPARED = 300  # names that are compared letter by letter with a mistyped one
 
 T = TypeVar("T")
@@ -164,9 +165,9 @@ def _check_each_complete(kind: Any, tables: Mapping[str, Mapping[str, object]], 
     for field in dataclasses.fields(kind):
         lacking = [places[name].table for name, table in tables.items() if field.name not in table]
         if _needed(field) and field.name != "name" and len(lacking) > 1:
-            raise ConfigurationError(
-                f"the key '{field.name}' is missing in {', '.join(lacking)}; {_what_to_write(field)}"
-            )
+            more = f" and {len(lacking) - MOST_TABLES} more" if len(lacking) > MOST_TABLES else ""
+            places_of = ", ".join(lacking[:MOST_TABLES])
+            raise ConfigurationError(f"the key '{field.name}' is missing in {places_of}{more}; {_what_to_write(field)}")
 
 
 def _check_range(bounds: Rule, value: object, place: _Place) -> None:

@@ -34,14 +34,16 @@ def cohort(arguments: argparse.Namespace, _: None, outputs: OutputFolder, progre
     from palpate.cohort.run import Options, run_cohort
     from palpate.cohort.table import read_derivatives, read_table
     from palpate.cohort.task import Limits
-    from palpate.images.input_file import like
+    from palpate.images.input_file import similar_names
     from palpate.parallel import processors
 
     table, template = arguments.table, arguments.template
     if arguments.scheduler is not None and arguments.workers is not None:
         raise ConfigurationError("--workers goes without --scheduler, whose cluster has workers of its own")
     if template is not None and not template.is_file():
-        raise ConfigurationError(f"there is no template {template}{like(template) or '; give the path of a case.toml'}")
+        raise ConfigurationError(
+            f"there is no template {template}{similar_names(template) or '; give the path of a case.toml'}"
+        )
     if table.is_dir():
         rows = read_derivatives(table, template, reference=arguments.reference)
     elif arguments.reference is not None:

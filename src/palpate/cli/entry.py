@@ -107,7 +107,7 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
     `written` gets the names of the files that take their places.
     """
     from palpate.case.file import read_case
-    from palpate.images.input_file import like
+    from palpate.images.input_file import similar_names
     from palpate.steps.display import PATIENCE_S, progress_on_stderr
 
     command: Callable[..., Outcome] = arguments.command
@@ -120,7 +120,7 @@ def _run(arguments: argparse.Namespace, written: list[str]) -> Outcome:
     if getattr(arguments, "add", ()):
         _into_added_folder(arguments)
     if not arguments.makes_folder and not arguments.output.is_dir():
-        advice = like(arguments.output) or "; name the output folder of an earlier run"
+        advice = similar_names(arguments.output) or "; name the output folder of an earlier run"
         raise InputDataError(f"there is no folder {arguments.output}{advice}")
     heading = f"palpate {version()}: {' '.join(sys.argv[1:])}"
     shared = getattr(arguments, "shard", None) is not None  # with runs of other shards

@@ -13,7 +13,7 @@ from uuid import uuid4
 from palpate.cohort.resolve import row_key
 from palpate.cohort.task import FAILURE_CLASSES, Limits, Outcome, Row, Task
 from palpate.errors import InputDataError, ResourceError
-from palpate.images.input_file import like
+from palpate.images.input_file import similar_names
 from palpate.parallel import mapped
 from palpate.study.outputs import RESULT, read_json, sha256_of, write_json
 
@@ -108,7 +108,7 @@ def write_plan(plan: Plan, folder: Path) -> None:
 def read_plan(folder: Path) -> Plan:
     """The plan that `write_plan` wrote; raises `InputDataError` when there is none."""
     if not (folder / PLAN).is_file():
-        advice = like(folder / PLAN) or "; name the --output folder of palpate cohort"
+        advice = similar_names(folder / PLAN) or "; name the --output folder of palpate cohort"
         raise InputDataError(f"there is no {folder / PLAN}, so no cohort{advice}")
     content = read_json(folder / PLAN)
     try:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from palpate.body.provenance import software_versions
 from palpate.errors import InputDataError, ResourceError
 from palpate.export.fitted_model import FittedBody, FittedModel
-from palpate.images.input_file import like, read_input
+from palpate.images.input_file import read_input, similar_names
 from palpate.images.segmentation import first_labels
 from palpate.images.tissue import tissue_colours
 from palpate.mesh.locate import modulus_image
@@ -217,7 +217,7 @@ def _series(folder: Path, body: FittedBody) -> list[Dataset]:
     """The slices, without their pixels, of the one series in a folder; the frame of reference of the first image."""
     pydicom = import_module("pydicom")
     if not folder.is_dir():
-        advice = like(folder) or "; name the folder of the first image's DICOM series"
+        advice = similar_names(folder) or "; name the folder of the first image's DICOM series"
         raise InputDataError(f"there is no folder {folder}{advice}")
     found: list[Dataset] = []
     for path in islice(sorted(folder.iterdir()), MOST_SLICES):

@@ -62,7 +62,7 @@ class InputFile(io.BufferedReader):
         return self._digested.digest.hexdigest()
 
 
-def like(path: Path) -> str:
+def similar_names(path: Path) -> str:
     """A hint where nothing is at `path` and a file or folder beside it has a similar name; else empty.
 
     It is compared where the path ends to exist: for `caes/case.toml` beside a folder `case` that is `case/case.toml`.
@@ -96,7 +96,7 @@ def open_input(path: Path) -> InputFile:
     try:
         descriptor = os.open(path, FLAGS)
     except FileNotFoundError as error:
-        raise FileNotFoundError(errno.ENOENT, f"there is no such file{like(Path(path))}", str(path)) from error
+        raise FileNotFoundError(errno.ENOENT, f"there is no such file{similar_names(Path(path))}", str(path)) from error
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise OSError(errno.EINVAL, f"it is {_kind(Path(path))}", str(path))

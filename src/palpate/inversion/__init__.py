@@ -21,7 +21,7 @@ from palpate.inversion.laplace import MarginalMinimum as MarginalMinimum
 from palpate.inversion.laplace import MarginalPosterior as MarginalPosterior
 from palpate.inversion.later_state import InverseProblem as InverseProblem
 from palpate.inversion.later_state import LaterState as LaterState
-from palpate.inversion.mixture import Candidates as Candidates
+from palpate.inversion.linear_evidence import Candidates as Candidates
 from palpate.inversion.mixture import Explanation as Explanation
 from palpate.inversion.mixture import Mixture as Mixture
 from palpate.inversion.mixture import mixture_of as mixture_of

@@ -15,7 +15,8 @@ from scipy import linalg
 
 from palpate.errors import ConfigurationError
 from palpate.inversion.later_state import InverseProblem
-from palpate.inversion.mixture import SEEN, Explanation, Mixture, beyond_bounds
+from palpate.inversion.linear_evidence import SEEN
+from palpate.inversion.mixture import Explanation, Mixture, beyond_bounds
 from palpate.inversion.optimise import Bounds
 from palpate.inversion.scenarios import Alternatives, scenarios_of
 from palpate.unknowns.likelihood import Likelihood

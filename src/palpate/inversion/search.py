@@ -17,7 +17,8 @@ from palpate.errors import EstimationError, NotConverged, SolverError
 from palpate.inversion.frozen_posterior import Posterior, cheapest_posterior
 from palpate.inversion.hyper_parameters import with_amplitudes, with_correlations, with_scales
 from palpate.inversion.laplace import MarginalMinimum, MarginalPosterior
-from palpate.inversion.mixture import Candidates, Mixture, mixture_of
+from palpate.inversion.linear_evidence import Candidates
+from palpate.inversion.mixture import Mixture, mixture_of
 from palpate.inversion.objective import Evaluation, LinearisedObjective, Objective
 from palpate.inversion.optimise import Bounds, Iterate, Minimum, Outcome, gauss_newton, same_minimum
 from palpate.inversion.scenarios import Alternatives, scenarios_of

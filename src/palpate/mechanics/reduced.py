@@ -286,10 +286,13 @@ class Projection:
 
     def components(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """V^T f (m, k) of f (n_free, k), of the rows alone that have any where these are few."""
-        values = times(self.model.constraint.free, forces)
-        rows = np.flatnonzero(values.any(axis=1))
-        few = 2 * len(rows) < len(values)
-        return self.reduced.components(values[rows], rows) if few else self.reduced.components(values)
+        return self._worked_on(times(self.model.constraint.free, forces))
+
+    def _worked_on(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Work (m, k) of nodal forces (n_dof, k) on each basis vector; of few rows that have any, by these alone."""
+        rows = np.flatnonzero(forces.any(axis=1))
+        few = 2 * len(rows) < len(forces)
+        return self.reduced.components(forces[rows], rows) if few else self.reduced.components(forces)
 
     def extended(self, snapshots: NDArray[np.float64]) -> Projection:
         """The projection on the span of the present vectors and of snapshots (n_free, k) mm.
@@ -335,10 +338,10 @@ class Projection:
 
     def at_displacement(self, values: NDArray[np.float64]) -> Projection:
         """The projection with the forces of the material modes at a displacement (n_dof,) mm of homogeneous tissues."""
-        by_material, vectors = self.model.material_by_region(values), self.reduced.output_basis
-        coupling, first = self.reduced.coupling.copy(), self.reduced.n_boundary
+        by_material, first = self.model.material_by_region(values), self.reduced.n_boundary
+        coupling, every = self.reduced.coupling.copy(), np.eye(self.reduced.n_modes - first)
         for of_region, forces in zip(coupling, by_material, strict=True):
-            of_region[:, first:-1] = np.concatenate([forces.work(block).T for block in vectors])
+            of_region[:, first:-1] = self._worked_on(forces.along(every))
         return replace(self, reduced=replace(self.reduced, coupling=coupling), by_material=by_material)
 
 

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 ROWS = 8192  # residuals whose rows are formed at once: some 30 MB
-MANY = 4  # residuals for each displacement, above which products with the sparse factor cost less than J itself
+FACTORED_ABOVE = (
+    4  # residuals for each displacement, above which products with the sparse factor cost less than J itself
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class Jacobian:
     def gram(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """J^T W J (n_columns, n_columns) for W = diag(weights (n,)), none negative."""
         matrix, total = self.by_displacement, np.zeros(2 * (self.tangent.shape[1],))
-        if matrix.shape[0] < MANY * matrix.shape[1]:
+        if matrix.shape[0] < FACTORED_ABOVE * matrix.shape[1]:
             for start in range(0, matrix.shape[0], ROWS):
                 part = slice(start, start + ROWS)
                 formed = np.asarray(matrix[part] @ self.tangent)

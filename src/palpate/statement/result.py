@@ -144,7 +144,7 @@ class CaseResult:
         return self.displacements_of(0)
 
     def displacements_of(self, pair: int) -> tuple[NDArray[np.float64], ...]:
-        """Those of a pair, by its number from 0; none where nothing was found."""
+        """Those of a pair, by its number from 0: (n_points, 3) mm a later state, none where nothing was found."""
         first = sum(len(before.later) for before in self.pairs[:pair])
         return self.estimation.displacements[first : first + len(self.pairs[pair].later)]
 

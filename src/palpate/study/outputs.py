@@ -22,7 +22,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from palpate.errors import InputDataError, ResourceError
-from palpate.images.input_file import like
+from palpate.images.input_file import similar_names
 from palpate.study.lock import folder_lock
 
 AREA = ".writing-outputs"  # the hidden folder for new files in an output folder
@@ -300,7 +300,7 @@ def read_regular(path: Path, *, most_bytes: int) -> bytes:
             return stream.read(most_bytes)
     except FileNotFoundError as error:
         kept = [str(place) for place in path.parent.glob(f"{EARLIER}*/{path.name}")]
-        advice = f"; a run that was killed left the earlier one: {kept[0]}" if kept else like(path)
+        advice = f"; a run that was killed left the earlier one: {kept[0]}" if kept else similar_names(path)
         advice = advice or "; run the estimate first, which writes it"
         raise InputDataError(f"there is no {path}{advice}") from error
     except OSError as error:

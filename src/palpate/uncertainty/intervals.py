@@ -58,7 +58,7 @@ def discretisation_sd(space: LagrangeSpace, tissues: Sequence[int]) -> float:
     s = c (h / d)^2 with h = (6 sqrt(2) V / N)^(1/3), the edge of N regular tetrahedra that fill the volume V of the
     `tissues` (by their index in the mesh; several that share a modulus together), twice that for linear elements, and
     d = 6 V / A with the area A of their surfaces: the diameter of a ball, three times the thickness of a plate. The
-    order is that of quadratic elements' surfaces; c is measured (`benchmarks/edge_length.py`, docs/method.md).
+    order is that of quadratic elements' surfaces; c is measured (`benchmarks/accuracy.py --edges`, docs/method.md).
     """
     mesh = space.mesh
     inside = np.isin(mesh.region, tissues)

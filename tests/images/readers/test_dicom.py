@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from pydicom.dataset import Dataset
 
+from case_texts import REST, case_text
 from dicom_files import TILTED, axes_of, ct_slices, save_contours, save_segmentation, save_series, traced
 from palpate.body.read import read_segmentation
 from palpate.case.file import read_case
@@ -302,9 +303,12 @@ def test_a_case_gives_contours_the_grid_of_its_grey_image(tmp_path: Path) -> Non
     shutil.rmtree(tmp_path / "ct")
     readers.write_scalar_image(tmp_path / "ct.nii.gz", np.zeros(whole.grid.shape), whole.grid)
     (tmp_path / "case.toml").write_text(
-        '[images]\nbefore = "a.dcm"\nafter = ["a.dcm"]\nintensities_before = "ct.nii.gz"\n'
-        '[tissues.gland]\nlabel = "prostate"\nrole = "estimate"\n'
-        '[tissues.rest]\nlabel = "remaining"\nrole = "known"\nyoungs_modulus_kpa = 10.0\n'
+        case_text(
+            {"gland": {"label": "prostate", "role": "estimate"}, "rest": REST},
+            before="a.dcm",
+            after=["a.dcm"],
+            images={"intensities_before": "ct.nii.gz"},
+        )
     )
     case = read_case(tmp_path / "case.toml")
     assert case.images is not None

@@ -71,7 +71,7 @@ def test_all_formats_and_programs_see_the_organs_at_one_place(
     np.testing.assert_allclose(centroids_here(wanted), centroids_by_nibabel(tmp_path / "a.nii.gz"), atol=1e-5)
 
 
-@pytest.mark.parametrize("ending", [".nrrd", ".mha"])
+@pytest.mark.parametrize("ending", [".nrrd", ".mha", ".nii.gz"])
 def test_oblique_axes_and_slices_are_those_of_itk(tmp_path: Path, ending: str) -> None:
     image = stored((2, 0, 1), (-1, 1, 1))
     turn = SimpleITK.Euler3DTransform((0, 0, 0), 0.2, -0.1, 0.3).GetMatrix()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,19 @@ __all__ = [
     "PAPER_STAGING",
     "PAPER_TABLE1",
     "PAPER_TABLE2",
+    "Entries",
     "Entry",
     "Table",
     "TableRow",
-    "as_part",
     "draw_table",
-    "entries_of",
+    "entry_of",
     "save_figure",
 ]
+
+Entry = dict[str, Any]
+"""What one column says of one body, of JSON: kpa (None when nothing converged), error_percent, interval95 (None where
+none is stated), verdict, iterations."""
+Entries = dict[str, Entry]  # by body: a part of the ledger
 
 # the paper's own numbers: Yang & Lin, tables 1 and 2, section 4.3 (correlations) and section 4.4 (iterations)
 PAPER_ITERATIONS = "less than 10"
@@ -38,7 +43,6 @@ PAPER_TABLE1: dict[float, dict[str, float]] = {
     130.0: {"sphere1": 112.89, "sphere2": 118.95, "sphere3": 124.89},
     150.0: {"sphere1": 132.87, "sphere2": 138.78, "sphere3": 145.32},
 }
-
 PAPER_TABLE2: dict[float, dict[str, float]] = {
     50.0: {"prostate": 53.28, "bladder": 49.67},
     100.0: {"prostate": 107.50, "bladder": 97.78},
@@ -47,75 +51,29 @@ PAPER_TABLE2: dict[float, dict[str, float]] = {
     250.0: {"prostate": 263.30, "bladder": 248.60},
     300.0: {"prostate": 315.14, "bladder": 296.86},
 }
-
 # Pearson's r with the T stage, and its two-tailed p
 PAPER_STAGING: dict[str, tuple[float, float]] = {"prostate": (0.658, 3.16e-5), "bladder": (0.481, 4.60e-3)}
 
 COLUMNS = ("same_mesh", "other_mesh", "voxels", "paper_method", "paper_method_other_mesh")
 IDENTIFIED = "identified"
 
-STYLE = {
-    "svg.fonttype": "none",
-    "font.family": "sans-serif",
-    "svg.hashsalt": "palpate",
-    "font.size": 9.0,
-    "axes.grid": True,
-    "grid.alpha": 0.3,
-}
+STYLE = {"svg.fonttype": "none", "svg.hashsalt": "palpate", "font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe & Ito 2008: safe for colour-blind
-MARKERS = ("o", "s", "^", "D", "v")
 SMALLEST = 1e-6  # per cent: what is smaller is drawn there
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """What one column says of one body; `kpa` is None when nothing converged, the interval where none is stated."""
-
-    kpa: float | None
-    error_percent: float | None
-    interval95: tuple[float | None, float | None] | None
-    verdict: str | None
-    iterations: int
-
-    @staticmethod
-    def of(
-        kpa: float | None,
-        truth: float,
-        *,
-        interval95: tuple[float | None, float | None] | None = None,
-        verdict: str | None = None,
-        iterations: int,
-    ) -> Entry:
-        """The entry of a modulus (kPa) beside its `truth` (kPa); the error is 100 (kpa / truth - 1)."""
-        error = None if kpa is None else 100.0 * (kpa / truth - 1.0)
-        return Entry(kpa, error, interval95, verdict, iterations)
-
-    @staticmethod
-    def from_dict(stored: Mapping[str, Any]) -> Entry:
-        """The entry that `asdict` has made a dictionary of, by way of JSON."""
-        interval = stored["interval95"]
-        return Entry(**{**stored, "interval95": None if interval is None else (interval[0], interval[1])})
-
-    def scaled(self, factor: float) -> Entry:
-        """The same problem in other units: moduli times `factor`, errors as they are."""
-        ends = self.interval95
-        scaled = None if ends is None else (ends[0] and factor * ends[0], ends[1] and factor * ends[1])
-        return replace(self, kpa=None if self.kpa is None else factor * self.kpa, interval95=scaled)
-
-    @property
-    def counts(self) -> bool:
-        """Whether its error is one of a stated result: not of a `weak` or `not identified` one."""
-        return self.error_percent is not None and self.verdict in (None, IDENTIFIED)
-
-
-def as_part(entries: Mapping[str, Entry]) -> dict[str, Any]:
-    """Entries by body as a part of the ledger."""
-    return {body: asdict(entry) for body, entry in entries.items()}
-
-
-def entries_of(part: Mapping[str, Any]) -> dict[str, Entry]:
-    """Entries by body of a part of the ledger."""
-    return {body: Entry.from_dict(stored) for body, stored in part.items()}
+def entry_of(
+    kpa: float | None,
+    truth: float,
+    *,
+    interval95: Sequence[float | None] | None = None,
+    verdict: str | None = None,
+    iterations: int,
+) -> Entry:
+    """The entry of a modulus (kPa) beside its `truth` (kPa); the error is 100 (kpa / truth - 1)."""
+    error = None if kpa is None else 100.0 * (kpa / truth - 1.0)
+    ends = None if interval95 is None else list(interval95)
+    return {"kpa": kpa, "error_percent": error, "interval95": ends, "verdict": verdict, "iterations": iterations}
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,21 +86,22 @@ class TableRow:
     paper_kpa: float | None
     columns: Mapping[str, Entry]
 
-    @property
-    def start_kpa(self) -> float:
-        """Half of the true modulus, as in the paper."""
-        return 0.5 * self.true_kpa
-
     def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
+        """As JSON; the start is half of the true modulus, as in the paper."""
         return {
             "body": self.body,
             "case": self.case,
             "true_kpa": self.true_kpa,
-            "start_kpa": self.start_kpa,
+            "start_kpa": 0.5 * self.true_kpa,
             "paper_kpa": self.paper_kpa,
-            "columns": {name: asdict(entry) for name, entry in self.columns.items()},
+            "columns": dict(self.columns),
         }
+
+    def stated(self, column: str) -> float | None:
+        """The absolute error (%) of a column's stated result: not of a `weak` or `not identified` one."""
+        entry = self.columns[column]
+        counts = entry["error_percent"] is not None and entry["verdict"] in (None, IDENTIFIED)
+        return abs(entry["error_percent"]) if counts else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,61 +114,43 @@ class Table:
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON; `worst_error_percent` of the voxels is over the identified rows."""
-        voxels = self._entries("voxels")
-        errors = [abs(e.error_percent) for e in voxels if e.counts and e.error_percent is not None]
+        errors = self._stated("voxels")
+        ends = [(row.columns["voxels"]["interval95"], row.true_kpa) for row in self.rows]
+        inside = [
+            (end[0] is None or end[0] <= truth) and (end[1] is None or truth <= end[1]) for end, truth in ends if end
+        ]
         return {
             "schema": "palpate.reproduce/1",
             "experiment": self.experiment,
             "rows": [row.to_dict() for row in self.rows],
-            "worst_error_percent": {name: self._worst(name) for name in COLUMNS},
+            "worst_error_percent": {name: max(self._stated(name), default=None) for name in COLUMNS},
             "voxels": {
                 "identified": len(errors),
-                "rows": len(voxels),
+                "rows": len(self.rows),
                 "rms_error_percent": float(np.sqrt(np.mean(np.square(errors)))) if errors else None,
-                "truth_inside_interval": self._inside(),
+                "truth_inside_interval": sum(inside),
             },
             "paper_iterations": PAPER_ITERATIONS,
             "notes": list(self.notes),
         }
 
+    def _stated(self, column: str) -> list[float]:
+        return [error for row in self.rows if (error := row.stated(column)) is not None]
+
     def text(self) -> list[list[str]]:
-        """Rows of cells for a terminal: the heading, then one line a body."""
-        heading = ["case", "body", "true kPa", "paper", *COLUMNS, "steps (paper's method)"]
-        return [heading, *(self._cells(row) for row in self.rows), self._last_line()]
-
-    def _cells(self, row: TableRow) -> list[str]:
-        paper = "" if row.paper_kpa is None else _cell(row.paper_kpa, 100.0 * (row.paper_kpa / row.true_kpa - 1.0))
-        ours = []
-        for name in COLUMNS:
-            entry = row.columns[name]
-            aside = "" if entry.verdict in (None, IDENTIFIED) else f", {entry.verdict}"
-            ours.append(_cell(entry.kpa, entry.error_percent) + aside)
-        steps = str(row.columns["paper_method"].iterations)
-        return [row.case, row.body, f"{row.true_kpa:g}", paper, *ours, steps]
-
-    def _last_line(self) -> list[str]:
-        papers = [abs(row.paper_kpa / row.true_kpa - 1.0) for row in self.rows if row.paper_kpa is not None]
-        worst = [self._worst(name) for name in COLUMNS]
-        cells = ["none" if value is None else f"{value:.2g} %" for value in worst]
-        return ["worst", "", "", f"{100.0 * max(papers):.4g} %" if papers else "", *cells, ""]
-
-    def _entries(self, column: str) -> Sequence[Entry]:
-        return [row.columns[column] for row in self.rows]
-
-    def _worst(self, column: str) -> float | None:
-        entries = self._entries(column)
-        errors = [abs(e.error_percent) for e in entries if e.counts and e.error_percent is not None]
-        return max(errors, default=None)
-
-    def _inside(self) -> int:
-        """How many voxel rows have the truth inside their 95 % interval."""
-        inside = 0
-        for row in self.rows:
-            interval = row.columns["voxels"].interval95
-            if interval is not None:
-                low, high = interval
-                inside += (low is None or low <= row.true_kpa) and (high is None or row.true_kpa <= high)
-        return inside
+        """Rows of cells for a terminal: the heading, one line a body, the worst errors."""
+        found = [["case", "body", "true kPa", "paper", *COLUMNS, "steps (paper's method)"]]
+        papers = [100.0 * (row.paper_kpa / row.true_kpa - 1.0) if row.paper_kpa else None for row in self.rows]
+        for row, paper in zip(self.rows, papers, strict=True):
+            cells = [row.case, row.body, f"{row.true_kpa:g}", "" if paper is None else _cell(row.paper_kpa, paper)]
+            for entry in (row.columns[name] for name in COLUMNS):
+                aside = "" if entry["verdict"] in (None, IDENTIFIED) else f", {entry['verdict']}"
+                cells.append(_cell(entry["kpa"], entry["error_percent"]) + aside)
+            found.append([*cells, str(row.columns["paper_method"]["iterations"])])
+        worst = [self._stated(name) for name in COLUMNS]
+        cells = [f"{max(errors):.2g} %" if errors else "none" for errors in worst]
+        theirs = [abs(paper) for paper in papers if paper is not None]
+        return [*found, ["worst", "", "", f"{max(theirs):.4g} %" if theirs else "", *cells, ""]]
 
 
 def _cell(kpa: float | None, error: float | None) -> str:
@@ -225,21 +166,15 @@ def draw_table(table: Table, path: Path) -> None:
         panels = figure.subplots(1, len(bodies), sharey=True, squeeze=False)[0]
         for axes, body in zip(panels, bodies, strict=True):
             rows = [row for row in table.rows if row.body == body]
-            places = np.arange(len(rows))
-            papers = [
-                (i, abs(100.0 * (r.paper_kpa / r.true_kpa - 1.0)))
-                for i, r in enumerate(rows)
-                if r.paper_kpa is not None
-            ]
-            if papers:
-                axes.plot(*zip(*papers, strict=True), linestyle="none", marker="x", color="black", label="the paper")
-            for name, colour, marker in zip(COLUMNS, COLOURS, MARKERS, strict=False):
-                errors = [row.columns[name].error_percent for row in rows]
+            lines: dict[str, list[float | None]] = {
+                name: [row.columns[name]["error_percent"] for row in rows] for name in COLUMNS
+            }
+            lines["the paper"] = [100.0 * (r.paper_kpa / r.true_kpa - 1.0) if r.paper_kpa else None for r in rows]
+            for (name, errors), colour, marker in zip(lines.items(), (*COLOURS[:5], "black"), "os^Dvx", strict=True):
                 sizes = [np.nan if error is None else max(abs(error), SMALLEST) for error in errors]
-                axes.plot(places, sizes, linestyle="none", marker=marker, color=colour, markersize=4.5, label=name)
+                axes.plot(sizes, linestyle="none", marker=marker, color=colour, markersize=4.5, label=name)
             axes.set_yscale("log")
-            axes.minorticks_off()
-            axes.set_xticks(places, [row.case for row in rows], rotation=60, ha="right", fontsize=7.5)
+            axes.set_xticks(range(len(rows)), [row.case for row in rows], rotation=60, ha="right", fontsize=7.5)
             axes.set_xlabel("true modulus, kPa")
             axes.set_title(body)
         panels[0].set_ylabel("absolute error of the modulus, %")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache, partial
-from typing import Any
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,16 +34,7 @@ from palpate_validation.paper.columns import (
     from_half,
     imaged_states,
 )
-from palpate_validation.paper.table import (
-    COLUMNS,
-    PAPER_TABLE1,
-    Entry,
-    Table,
-    TableRow,
-    as_part,
-    draw_table,
-    entries_of,
-)
+from palpate_validation.paper.table import COLUMNS, PAPER_TABLE1, Entries, Entry, Table, TableRow, draw_table
 from palpate_validation.scenes import Job, Part, Progress, Scenes
 
 __all__ = ["Table1Settings", "table1"]
@@ -95,10 +85,8 @@ def _rows(settings: Table1Settings, parts: Mapping[str, Part]) -> Table:
     rows: list[TableRow] = []
     for moduli in settings.cases:
         unit = _first_like(moduli, settings.cases)
-        columns = {"voxels": entries_of(parts[f"{_name(moduli)} voxels"])}
-        for column in SURFACE_COLUMNS:
-            found = entries_of(parts[f"{_name(unit)} {column}"])
-            columns[column] = {body: entry.scaled(moduli[0] / unit[0]) for body, entry in found.items()}
+        columns = {column: _scaled(parts[f"{_name(unit)} {column}"], moduli[0] / unit[0]) for column in SURFACE_COLUMNS}
+        columns["voxels"] = parts[f"{_name(moduli)} voxels"]
         for body, truth in zip(BODIES, moduli, strict=True):
             paper = PAPER_TABLE1.get(truth, {}).get(body) if len(set(moduli)) == 1 else None
             entries = {column: columns[column][body] for column in COLUMNS}
@@ -106,13 +94,19 @@ def _rows(settings: Table1Settings, parts: Mapping[str, Part]) -> Table:
     return Table("table1", tuple(rows), NOTES)
 
 
-def _part(settings: Table1Settings, key: str, progress: Progress) -> dict[str, Any]:
-    """The part of a key "case column"."""
-    name, column = key.rsplit(" ", 1)
-    number = [_name(moduli) for moduli in settings.cases].index(name)
-    case = _Case(settings.cases[number], _bench(settings.balls), settings.seed + number)
-    progress(f"table 1, {name} kPa: {column}")
-    return as_part(case.column(column, progress))
+def _scaled(entries: Entries, factor: float) -> Entries:
+    """The same problem in other units: moduli times `factor`, errors as they are."""
+
+    def times(value: float | None) -> float | None:
+        """In the other units."""
+        return value and factor * value
+
+    def scaled(entry: Entry) -> Entry:
+        """With its interval."""
+        ends = entry["interval95"] and [times(end) for end in entry["interval95"]]
+        return entry | {"kpa": times(entry["kpa"]), "interval95": ends}
+
+    return {body: scaled(entry) for body, entry in entries.items()}
 
 
 def _first_like(moduli: Moduli, cases: tuple[Moduli, ...]) -> Moduli:
@@ -124,89 +118,83 @@ def _name(moduli: Moduli) -> str:
     return f"{moduli[0]:g}" if len(set(moduli)) == 1 else "/".join(f"{modulus:g}" for modulus in moduli)
 
 
-@dataclass(frozen=True)
-class _Bench:
-    """Models that all cases share, made when they are first needed; their load is a pull of 1 kPa."""
-
-    balls: Balls
-
-    @cached_property
-    def coarse(self) -> LinearModel:
-        """The model that inverts."""
-        return _model(balls_space(self.balls, self.balls.edge_mm))
-
-    @cached_property
-    def fine(self) -> LinearModel:
-        """The truth of the columns `other_mesh` and `voxels`."""
-        return _model(balls_space(self.balls, self.balls.truth_edge_mm))
-
-    @cached_property
-    def linear_tetrahedra(self) -> LinearModel:
-        """The paper's model: the inverting mesh with linear tetrahedra."""
-        return _model(balls_space(self.balls, self.balls.edge_mm, element="P1"))
+def _part(settings: Table1Settings, key: str, progress: Progress) -> Entries:
+    """The part of a key "case column"."""
+    name, column = key.rsplit(" ", 1)
+    number = [_name(moduli) for moduli in settings.cases].index(name)
+    case = _Case(settings.cases[number], settings.balls, settings.seed + number)
+    progress(f"table 1, {name} kPa: {column}")
+    balls = settings.balls
+    if column == "voxels":
+        return case.from_voxels(progress)
+    if column == "paper_method":
+        return case.by_the_paper(_model(balls, balls.edge_mm, "P1"))
+    fine = _model(balls, balls.truth_edge_mm)
+    if column == "paper_method_other_mesh":
+        return case.by_the_paper(fine)
+    return case.from_surfaces(fine if column == "other_mesh" else _model(balls, balls.edge_mm), progress)
 
 
-_bench = lru_cache(maxsize=1)(_Bench)
+@lru_cache(maxsize=3)
+def _model(balls: Balls, edge_mm: float, element: str = "P2") -> LinearModel:
+    """A model under a pull of 1 kPa."""
+    return _floating(balls_space(balls, edge_mm, element=element))
+
+
+def _floating(space: LagrangeSpace) -> LinearModel:
+    return linear_model(space, floating(space), loads=(pulled(space, 1.0),))
 
 
 @dataclass(frozen=True)
 class _Case:
-    """Three moduli (kPa) and the columns that they give."""
+    """Three moduli (kPa), and what is said of them; `seed`: of the voxels."""
 
     moduli: Moduli
-    bench: _Bench
+    balls: Balls
     seed: int
-
-    def column(self, name: str, progress: Progress) -> dict[str, Entry]:
-        """What a column says of each body."""
-        makers: dict[str, Callable[[], dict[str, Entry]]] = {
-            "same_mesh": lambda: self.from_surfaces(self.bench.coarse, progress),
-            "other_mesh": lambda: self.from_surfaces(self.bench.fine, progress),
-            "voxels": lambda: self.from_voxels(progress),
-            "paper_method": lambda: self.by_the_paper(self.bench.linear_tetrahedra),
-            "paper_method_other_mesh": lambda: self.by_the_paper(self.bench.fine),
-        }
-        return makers[name]()
 
     @property
     def truth(self) -> dict[str, float]:
         """True modulus (kPa) of every sphere, by name."""
         return dict(zip(BODIES, self.moduli, strict=True))
 
-    @cached_property
+    @property
     def stress_kpa(self) -> float:
         """The pull under which the region that is deformed most is deformed by 9.5 %."""
-        model = self.bench.coarse
+        model = _model(self.balls, self.balls.edge_mm)
         unit = model.solve(np.array(self.moduli), np.zeros(model.n_modes)).displacement
         return float(DEFORMATION / mean_deformations(model.space, unit).max())
 
+    def under_pull(self, model: LinearModel) -> LinearModel:
+        """The model under that pull."""
+        return model.with_conditions(Conditions(model.constraint, (pulled(model.space, self.stress_kpa),)))
+
     def displacement(self, model: LinearModel) -> Array:
         """Displacement (n_points, 3) mm of the truth on a model's mesh."""
-        loaded = _pulled_by(model, self.stress_kpa)
-        return loaded.solve(np.array(self.moduli), np.zeros(model.n_modes)).displacement
+        return self.under_pull(model).solve(np.array(self.moduli), np.zeros(model.n_modes)).displacement
 
-    def from_surfaces(self, truth: LinearModel, progress: Progress) -> dict[str, Entry]:
+    def from_surfaces(self, truth: LinearModel, progress: Progress) -> Entries:
         """What exact surfaces of `truth` say of every sphere."""
-        model = _pulled_by(self.bench.coarse, self.stress_kpa)
+        model = self.under_pull(_model(self.balls, self.balls.edge_mm))
         seen = exact_surfaces(model.space, truth.space, self.displacement(truth))
-        inversion, settings = self.invert_case(model, seen, progress)
-        return entries_from_surfaces(inversion, settings, self.truth)
+        return entries_from_surfaces(*self.inverted(model, seen, progress), self.truth)
 
-    def from_voxels(self, progress: Progress) -> dict[str, Entry]:
+    def from_voxels(self, progress: Progress) -> Entries:
         """What two label images on a random grid say of every sphere."""
-        balls, fine = self.bench.balls, self.bench.fine
-        grid = random_grid(balls, np.random.default_rng(self.seed))
+        fine = _model(self.balls, self.balls.truth_edge_mm)
+        grid = random_grid(self.balls, np.random.default_rng(self.seed))
         space = replace(fine.space, mesh=replace(fine.space.mesh, tissues=balls_tissues(self.moduli)))
         states = imaged_states(space, (self.displacement(fine),), grid)
-        mechanics = Mechanics(law="linear", element="P2")
-        case = Case("table1", phantom=Phantom("spheres"), mesh=MeshSettings(balls.edge_mm), mechanics=mechanics)
-        body = make_body(states, case, progress=progress)
-        model = _pulled_by(_model(body.space), self.stress_kpa)
+        mechanics, mesh = Mechanics(law="linear", element="P2"), MeshSettings(self.balls.edge_mm)
+        body = make_body(
+            states, Case("table1", phantom=Phantom("spheres"), mesh=mesh, mechanics=mechanics), progress=progress
+        )
         surfaces = tuple(observed_surface(body.space, number) for number in range(len(BODIES)))
-        inversion, settings = self.invert_case(model, surface_distances(body.imaged(), surfaces)[0], progress)
+        seen = surface_distances(body.imaged(), surfaces)[0]
+        inversion, settings = self.inverted(self.under_pull(_floating(body.space)), seen, progress)
         return entries_from_voxels(inversion, settings, body, self.truth, seed=self.seed)
 
-    def invert_case(
+    def inverted(
         self, model: LinearModel, observations: tuple[Observation, ...], progress: Progress
     ) -> tuple[Inversion, InversionSettings]:
         """The inversion of all spheres' surfaces from half of their moduli, and its settings."""
@@ -215,9 +203,9 @@ class _Case:
         problem = InverseProblem((LaterState(model, observations),), mapping)
         return invert(problem, settings, progress=progress), settings
 
-    def by_the_paper(self, truth: LinearModel) -> dict[str, Entry]:
+    def by_the_paper(self, truth: LinearModel) -> Entries:
         """The paper's method; a few nodes hold the rigid motion, with the displacement that the truth has there."""
-        own, u = self.bench.linear_tetrahedra, self.displacement(truth)
+        own, u = _model(self.balls, self.balls.edge_mm, "P1"), self.displacement(truth)
         offset = np.zeros(len(own.constraint.offset))
         for dof in np.flatnonzero(own.constraint.modes.any(axis=1)):
             away = truth.space.points - own.space.points[dof // 3]
@@ -227,12 +215,3 @@ class _Case:
         held = replace(own.constraint, modes=np.zeros((len(offset), 0)), offset=offset)
         model = own.with_conditions(Conditions(held, (pulled(own.space, self.stress_kpa),)))
         return entries_by_the_paper(model, truth.space, u, self.truth, moduli=0.5 * np.array(self.moduli))
-
-
-def _model(space: LagrangeSpace) -> LinearModel:
-    return linear_model(space, floating(space), loads=(pulled(space, 1.0),))
-
-
-def _pulled_by(model: LinearModel, stress_kpa: float) -> LinearModel:
-    """The model with a pull of `stress_kpa` instead of 1 kPa."""
-    return model.with_conditions(Conditions(model.constraint, (pulled(model.space, stress_kpa),)))

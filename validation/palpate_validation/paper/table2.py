@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +15,10 @@ from palpate.case import Case, Domain, DriverMotion, Mechanics, MeshSettings, Ph
 from palpate.images import VoxelGrid, observation_width, smoothing_width
 from palpate.inversion import InverseProblem, LaterState, invert
 from palpate.mechanics import (
-    LinearisedSystem,
     LinearModel,
     choose_element,
     linear_model,
     outer_constraint,
-    weighted_sum,
 )
 from palpate.mesh import LagrangeSpace, anatomy_of, check_mesh, lagrange_space, tetrahedralise
 from palpate.observation import observations, prescribed_motion
@@ -36,16 +33,7 @@ from palpate_validation.paper.columns import (
     with_motions,
 )
 from palpate_validation.paper.real_pelvis import ORGANS, SMOOTHING_MM, RealPelvis, grid_within, real_pelvis
-from palpate_validation.paper.table import (
-    COLUMNS,
-    PAPER_TABLE2,
-    Entry,
-    Table,
-    TableRow,
-    as_part,
-    draw_table,
-    entries_of,
-)
+from palpate_validation.paper.table import COLUMNS, PAPER_TABLE2, Entries, Table, TableRow, draw_table
 from palpate_validation.scenes import Job, Part, Progress, Scenes
 
 __all__ = ["SURROUNDINGS_KPA", "Table2Settings", "table2"]
@@ -103,25 +91,29 @@ def table2(settings: Table2Settings) -> Scenes[Table]:
 def _rows(settings: Table2Settings, parts: Mapping[str, Part]) -> Table:
     rows: list[TableRow] = []
     for kpa in settings.moduli_kpa:
-        columns = {column: entries_of(parts[f"{kpa:g} {column}"]) for column in COLUMNS}
         papers = PAPER_TABLE2.get(kpa, {})
-        rows += [
-            TableRow(f"{kpa:g}", organ, kpa, papers.get(organ), {c: columns[c][organ] for c in COLUMNS})
-            for organ in ORGANS
-        ]
+        for organ in ORGANS:
+            entries = {column: parts[f"{kpa:g} {column}"][organ] for column in COLUMNS}
+            rows.append(TableRow(f"{kpa:g}", organ, kpa, papers.get(organ), entries))
     return Table("table2", tuple(rows), NOTES)
 
 
-def _part(settings: Table2Settings, key: str, progress: Progress) -> dict[str, Any]:
+def _part(settings: Table2Settings, key: str, progress: Progress) -> Entries:
     """The part of a key "modulus column"."""
     name, column = key.rsplit(" ", 1)
     progress(f"table 2, {name} kPa: {column}")
     number = [f"{kpa:g}" for kpa in settings.moduli_kpa].index(name)
-    kpa = settings.moduli_kpa[number]
+    kpa, bench = settings.moduli_kpa[number], _bench(settings)
     if column == "voxels":
         _surfaces.cache_clear()  # a process that goes on with another job does not hold the factors of both
-        return as_part(_imaged(settings, number % settings.positions).voxels(kpa, progress))
-    return as_part(_surfaces(settings).column(column, kpa, progress))
+        return _imaged(settings, number % settings.positions).voxels(kpa, progress)
+    seen = _surfaces(settings)
+    if column.startswith("paper_method"):
+        return seen.by_the_paper(kpa, other_mesh=column != "paper_method")
+    if column == "other_mesh":
+        return seen.from_surfaces(kpa, bench.fine, _truth(settings, kpa), progress)
+    own = seen.coarse.solve(moduli_of(seen.coarse, kpa), np.zeros(0)).displacement
+    return seen.from_surfaces(kpa, seen.coarse, own, progress)
 
 
 @lru_cache(maxsize=1)
@@ -131,6 +123,7 @@ def _bench(settings: Table2Settings) -> _Bench:
 
 @lru_cache(maxsize=8)
 def _truth(settings: Table2Settings, kpa: float) -> Array:
+    """Displacement (n_points, 3) mm of the finer mesh."""
     fine = _bench(settings).fine
     return fine.solve(moduli_of(fine, kpa), np.zeros(0)).displacement
 
@@ -186,15 +179,11 @@ class _Bench:
 
     def filling_modes(self, model: LinearModel) -> Array:
         """Coefficients (n_modes,) of a model's modes that come nearest to the filling of the wall."""
-        if not model.n_modes:
-            return np.zeros(0)
-        offset = self.pelvis.filling(model.space, self.settings.filling_mm).ravel()
-        rows = np.flatnonzero(model.constraint.modes.any(axis=1))
-        return np.asarray(np.linalg.lstsq(model.constraint.modes[rows], offset[rows], rcond=None)[0])
-
-    def truth(self, kpa: float) -> Array:
-        """Displacement (n_points, 3) mm of the finer mesh."""
-        return _truth(self.settings, kpa)
+        found, modes = np.zeros(model.n_modes), model.constraint.modes  # material modes stay at zero
+        offset, rows = self.pelvis.filling(model.space, self.settings.filling_mm).ravel(), modes.any(axis=1)
+        if modes.shape[1]:
+            found[: modes.shape[1]] = np.linalg.lstsq(modes[rows], offset[rows], rcond=None)[0]
+        return found
 
 
 @dataclass(frozen=True)
@@ -218,25 +207,7 @@ class _Surfaces:
         """The reduced model of `coarse`."""
         return self.bench.basis_of(self.coarse)
 
-    def column(self, name: str, kpa: float, progress: Progress) -> dict[str, Entry]:
-        """What a column that sees no voxels says of both organs."""
-        makers: dict[str, Callable[[], dict[str, Entry]]] = {
-            "same_mesh": lambda: self.from_surfaces(kpa, self.coarse, self.coarse_truth(kpa), progress),
-            "other_mesh": lambda: self.from_surfaces(kpa, self.bench.fine, self.bench.truth(kpa), progress),
-            "paper_method": lambda: self.by_the_paper(kpa, other_mesh=False),
-            "paper_method_other_mesh": lambda: self.by_the_paper(kpa, other_mesh=True),
-        }
-        return makers[name]()
-
-    def coarse_truth(self, kpa: float) -> Array:
-        """Displacement (n_points, 3) mm of the inverting mesh."""
-        nearby, model = self.basis.factorisation, self.coarse
-        moduli, constraint = moduli_of(model, kpa), model.constraint
-        loads = weighted_sum(moduli, model.coupling).toarray()
-        system = LinearisedSystem(weighted_sum(moduli, model.free_stiffness), nearby, symmetric=True)
-        return np.asarray(constraint.offset + constraint.free @ system.solve(-loads)[:, 0]).reshape(-1, 3)
-
-    def from_surfaces(self, kpa: float, truth: LinearModel, u: Array, progress: Progress) -> dict[str, Entry]:
+    def from_surfaces(self, kpa: float, truth: LinearModel, u: Array, progress: Progress) -> Entries:
         """What the exact surfaces of `truth` under u (n_points, 3) mm say of both organs."""
         seen = exact_surfaces(self.coarse.space, truth.space, u)
         mapping = parameter_map(truth.space.mesh.tissues, self.coarse.regions, unit_blocks(self.coarse.n_modes))
@@ -245,11 +216,11 @@ class _Surfaces:
         inversion = invert(InverseProblem((state,), mapping), settings, progress=progress)
         return entries_from_surfaces(inversion, settings, dict.fromkeys(ORGANS, kpa))
 
-    def by_the_paper(self, kpa: float, *, other_mesh: bool) -> dict[str, Entry]:
+    def by_the_paper(self, kpa: float, *, other_mesh: bool) -> Entries:
         """The paper's method on data of its own mesh, or on those of `other_mesh`."""
         own = self.linear_tetrahedra
         space = self.bench.fine.space if other_mesh else own.space
-        u = self.bench.truth(kpa) if other_mesh else own.solve(moduli_of(own, kpa), np.zeros(0)).displacement
+        u = _truth(self.bench.settings, kpa) if other_mesh else own.solve(moduli_of(own, kpa), np.zeros(0)).displacement
         start = moduli_of(own, 0.5 * kpa)
         return entries_by_the_paper(own, space, u, dict.fromkeys(ORGANS, kpa), moduli=start)
 
@@ -302,9 +273,9 @@ class _Imaged:
 
     def later(self, kpa: float) -> list[Array]:
         """Displacements (n_points, 3) mm of the later states: the linear law's grow with the filling."""
-        return [share * self.bench.truth(kpa) for share in self.bench.settings.shares]
+        return [share * _truth(self.bench.settings, kpa) for share in self.bench.settings.shares]
 
-    def voxels(self, kpa: float, progress: Progress) -> dict[str, Entry]:
+    def voxels(self, kpa: float, progress: Progress) -> Entries:
         """What the label images alone say of both organs."""
         imaged_later = with_motions(self.body.states, self.bench.fine.space, self.later(kpa))
         body = replace(self.body, states=imaged_later)

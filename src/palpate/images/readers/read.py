@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.errors import InputDataError, ResourceError
-from palpate.images.input_file import like
+from palpate.images.input_file import similar_names
 from palpate.images.label_image import LabelImage, VoxelGrid
 from palpate.images.named_labels import LabelTable, checked_table
 from palpate.images.readers.isolation import ReadLimits, read_stored
@@ -84,7 +84,7 @@ def _check_file(path: Path) -> None:
         found = path.stat()
     except FileNotFoundError as error:
         advice = "; check the path, which in a case file or cohort table begins at that file, and whether it was moved"
-        raise InputDataError(f"there is no file '{path}'{like(path) or advice}") from error
+        raise InputDataError(f"there is no file '{path}'{similar_names(path) or advice}") from error
     except (OSError, ValueError) as error:
         flaw = f"'{path}' cannot be opened ({error})"
         raise InputDataError(f"{flaw}; check the path and your right to read it") from error
