@@ -41,6 +41,7 @@ from palpate.observation.noise_model import NoiseModel
 from palpate.observation.prescribed_motion import FrameMotion, PrescribedMotion, bone_offset, prescribed_motion
 from palpate.observation.registry import observations
 from palpate.observation.surface_distance import SurfaceDistance
+from palpate.parallel import blas_on_one_thread
 from palpate.progress import Line, Progress, grouped
 from palpate.unknowns import (
     Block,
@@ -90,6 +91,7 @@ class Body:
         return ImagedBody(self.space, states.before, states.after, self.smoothing_mm, stated_noise)
 
 
+@blas_on_one_thread()
 def make_body(states: ImagedStates, case: Case, *, progress: Progress, mesh: TetMesh | None = None) -> Body:
     """Mesh the reference state of the images (see `mesh_reference`), unless a `mesh` is given; raises as that does."""
     element = choose_element(case.mechanics.element).space

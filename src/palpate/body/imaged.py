@@ -21,6 +21,7 @@ from palpate.images.surface_alignment import SurfaceMaps, align_surfaces, surfac
 from palpate.images.tissue import Role
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import DataSource
+from palpate.parallel import blas_on_one_thread
 from palpate.progress import Progress, silent
 
 SMALL_FRAME_MOTION = 1.0 / 3.0  # of the organs' relative motion: a smaller motion of the frame is not reported
@@ -74,6 +75,7 @@ class ImagedStates:
         return tuple(image.volume(tissue) for image in (self.before, *self.after))
 
 
+@blas_on_one_thread()
 def aligned(
     before: Segmentation,
     after: tuple[Segmentation, ...],

@@ -40,7 +40,7 @@ ROUGHNESS_MM = 1.0  # of a surface from place to place
 SHIFT_MM, TURN_DEG = 10.0, 10.0  # standard deviation of each component of the motion, before anything is seen
 CLEARLY = 5.0  # log of the odds by which a motion must explain the images better than none
 LEAST_WEIGHT = 1e-3
-NEGLIGIBLE = 1e-6  # of the largest variance of a smooth motion: moves the result by 1e-4 mm
+NEGLIGIBLE = 1e-4  # variance of a smooth motion of variance 1 that is left out: moves the result by 1e-4 mm
 MOST_STEPS = 40
 STEP_TOLERANCE_MM = 1e-3
 
@@ -232,10 +232,15 @@ def _descended(surfaces: Sequence[_Shown], centre: NDArray[np.float64], trial: _
 
 
 def _factor(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """F (n, r) of F F^T, a smooth covariance (n, n) but for what is too small to tell."""
-    values, vectors = np.linalg.eigh(covariance)
-    kept = values > NEGLIGIBLE * values[-1]
-    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+    """F (n, r) of F F^T, a smooth covariance (n, n) but for what is too small to tell.
+
+    By Cholesky's factorisation with pivots, which ends at the rank r (Harbrecht, Peters & Schneider, Appl. Numer. Math.
+    62 (2012) 428).
+    """
+    lower, order, rank, _ = linalg.lapack.dpstrf(covariance, tol=NEGLIGIBLE, lower=1)
+    factor = np.zeros((len(covariance), rank))
+    factor[order - 1] = np.tril(lower)[:, :rank]
+    return factor
 
 
 @dataclass(frozen=True, slots=True)

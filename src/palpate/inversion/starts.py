@@ -28,7 +28,7 @@ from palpate.mechanics.linear_model import LinearModel, LinearSystem, of_same_bo
 from palpate.mechanics.reduced import Projection, free_combinations, projection
 from palpate.parallel import mapped
 from palpate.progress import Progress
-from palpate.unknowns.blocks import FIELD, Acts, Block, Choice
+from palpate.unknowns.blocks import Acts, Block, Choice
 from palpate.unknowns.parameters import ParameterMap
 
 SCREENED = 0.01  # decrement at which the minimum of a start ends
@@ -296,9 +296,7 @@ def informed_combinations(
     of_images = [root.T @ information @ root for information in informations]
     _, vectors = linalg.eigh(np.mean(of_images, axis=0))
     sizes = [np.einsum("ij,ij->j", vectors, seen @ vectors) for seen in of_images]
-    left = np.max(np.cumsum(np.maximum(sizes, 0.0), axis=1), axis=0) < (
-        LEFT_OUT_OF_MAP if block.cause == FIELD else LEFT_OUT
-    )
+    left = np.max(np.cumsum(np.maximum(sizes, 0.0), axis=1), axis=0) < (LEFT_OUT_OF_MAP if block.mapped else LEFT_OUT)
     left[-1:] = False
     kept = vectors[:, ~left][:, ::-1]
     unit = float(np.sqrt(np.mean(np.diag(block.widest))))  # coefficients keep their size

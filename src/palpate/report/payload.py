@@ -91,8 +91,8 @@ def payload(data: ReportData, preview: Sequence[PreviewImage] = ()) -> Payload:
         "roles": ROLE_COLOURS,
         "unit": data.unit,
         "tissues": [
-            {"name": tissue.name, "role": tissue.role, "colour": tissue.colour, "modulus": modulus}
-            for tissue, modulus in zip(data.tissues, np.where(np.isnan(moduli), None, moduli), strict=True)
+            {"name": t.name, "role": t.role, "colour": t.colour, "modulus": None if np.isnan(modulus) else modulus}
+            for t, modulus in zip(data.tissues, moduli.tolist(), strict=True)
         ],
         "views": VIEWS,
         "grey_steps": GREY_STEPS,

@@ -14,7 +14,7 @@ from palpate.inversion import Inversion
 from palpate.mechanics.finite_strain import NEARLY_INCOMPRESSIBLE
 from palpate.mesh.surface import cut_faces
 from palpate.uncertainty import NORMAL_95, FittedState
-from palpate.unknowns import LAYER, POISSON, Choice, in_series
+from palpate.unknowns import Acts, Choice, in_series
 
 TOLD = 2.0  # standard deviations, above which an offset is reported in words
 LEAST_TOLD_MM = 0.1
@@ -117,7 +117,7 @@ def fitted_materials(inversion: Inversion) -> tuple[FittedMaterial, ...]:
     parameters, found = inversion.objective.parameters, list[FittedMaterial]()
     unknowns = inversion.minimum.unknowns
     coefficients, blocks = parameters.coefficients(unknowns), enumerate(parameters.blocks)
-    layers = [(b, unknowns[parameters.columns(i)]) for i, b in blocks if b.cause == LAYER]
+    layers = [(b, unknowns[parameters.columns(i)]) for i, b in blocks if b.choice is Choice.LAYERS]
     sought = {block.of for block in parameters.blocks if block.sought}
     for state, of_state in zip(inversion.objective.states, coefficients, strict=True):
         mesh, material = state.model.space.mesh, state.model.material
@@ -145,18 +145,18 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
     for number, block in enumerate(parameters.blocks):
         own = parameters.columns(number)
         learned = float(np.sqrt(np.mean(np.diag(parameters.priors[number].covariance)))) if block.size else 0.0
-        if block.cause == "offset":
+        if block.acts is Acts.RESIDUALS and block.choice is not Choice.NONE:
             variance = block.widest[0, 0] if block.choice is Choice.HELD else variances(own)[0]
             value, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(variance))
             offsets.append(OffsetFound(block.of, block.states[0], value, (value - half, value + half)))
-        elif block.cause == "heterogeneity":
+        elif block.choice is Choice.PATCHINESS and not block.mapped:
             patchy = block.alternatives[1].covariance  # the first is nearly homogeneous, the last very patchy
             heterogeneity.append(HeterogeneityFound(block.of, learned, float(np.sqrt(np.mean(np.diag(patchy))))))
-        elif block.cause == LAYER and inversion.mixture.explanations[0].chosen.get(number):
+        elif block.choice is Choice.LAYERS and inversion.mixture.explanations[0].chosen.get(number):
             x, half = float(unknowns[own[0]]), NORMAL_95 * float(np.sqrt(variances(own)[0]))
             low, ratio, high = np.exp([x - half, x, x + half]).tolist()
             layers.append(LayerFound(block.of, ratio, (low, high)))
-        elif block.cause == POISSON and not block.sought:
+        elif block.acts is Acts.MATERIAL and block.choice is Choice.NONE and not block.sought:
             pair += 1
             model = inversion.objective.states[block.states[0]].model
             found = zip(model.material.poisson, unknowns[own].tolist(), variances(own).tolist(), strict=False)
@@ -165,7 +165,7 @@ def discrepancy_of(inversion: Inversion, states: Sequence[FittedState]) -> Found
                 fitted = min(tissue.poisson_ratio + shift, NEARLY_INCOMPRESSIBLE)
                 sd = float(np.sqrt(variance))
                 ratios.append(PoissonRatioFound(tissue.name, pair, tissue.poisson_ratio, fitted, sd))
-        elif block.cause == "frame":
+        elif block.choice is Choice.FRAME:
             smooth.setdefault(block.states[0], learned * block.unit_mm)
     frames = list[FrameFound | None]([None] * len(states))
     for s, prior_mm in smooth.items():

@@ -128,7 +128,7 @@ def fast_variations(
             found.append(_stated(names, ("driver_prior", "", f"{width:g} times as wide"), change))
         # the finer half of each wall's modes, which are sorted by their size
         blocks = inversion.objective.parameters.blocks
-        finer = [(np.arange(b.size) >= 3 * (b.size // 6)) & (b.cause == "driver") for b in blocks]
+        finer = [(np.arange(b.size) >= 3 * (b.size // 6)) & b.moves_driver for b in blocks]
         fewer = partial(path.shift, dropped=np.concatenate(finer))
         found.append(_stated(names, ("driver_modes", "", "the smoother half alone"), fewer))
     return tuple(found)
@@ -166,7 +166,7 @@ def what_would_change(
         for each, pulled in zip(inputs, path.pulled([each.errors for each in inputs]), strict=True)
         for amount, words in each.amounts
     ]
-    frame = np.concatenate([np.zeros(0, dtype=bool), *(np.full(b.size, b.cause == "frame") for b in blocks)])
+    frame = np.concatenate([np.zeros(0, dtype=bool), *(np.full(b.size, b.choice is Choice.FRAME) for b in blocks)])
     if frame.any():
         changes.append((("frame", "", "held still"), partial(path.shift, dropped=frame)))
 

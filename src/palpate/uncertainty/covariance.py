@@ -177,7 +177,7 @@ def _held(objective: Objective, evaluation: Evaluation, rows: NDArray[np.float64
 def _given_model(objective: Objective, evaluation: Evaluation) -> Evaluation:
     """The evaluation with the unknowns of parameters and drivers alone, all others held where they are."""
     parameters = objective.parameters
-    drivers = [parameters.columns(i) for i, block in enumerate(parameters.blocks) if block.cause == "driver"]
+    drivers = [parameters.columns(i) for i, block in enumerate(parameters.blocks) if block.moves_driver]
     own = np.concatenate([np.arange(parameters.n_parameters), *drivers])
     if len(own) == parameters.n_unknowns:
         return evaluation

@@ -112,7 +112,7 @@ class FastPath:
         if width != 1.0 or dropped is not None:
             priors = list(parameters.priors)
             for i, block in enumerate(parameters.blocks):
-                covariance = (width if block.cause == "driver" else 1.0) ** 2 * priors[i].covariance
+                covariance = (width if block.moves_driver else 1.0) ** 2 * priors[i].covariance
                 if dropped is not None:
                     held = DROPPED * np.diag(dropped[parameters.columns(i) - n])
                     covariance = np.asarray(np.linalg.inv(np.linalg.inv(covariance) + held))

@@ -15,7 +15,7 @@ from palpate.mechanics.material import field_modes
 from palpate.mesh.tet_mesh import FACES, TetMesh
 from palpate.uncertainty.covariance import covariance_among
 from palpate.uncertainty.intervals import NORMAL_95, Interval
-from palpate.unknowns import FIELD, Acts
+from palpate.unknowns import Acts
 
 CONTRAST = 1.5  # least ratio for a part to have another stiffness than its tissue
 CERTAIN, LIKELY = 0.95, 0.5  # posterior probability of that: somewhere in a region that is reported, all over it
@@ -126,7 +126,7 @@ def stiffness_maps(inversion: Inversion, variances: NDArray[np.float64]) -> tupl
     objective, minimum, maps = inversion.objective, inversion.minimum, list[StiffnessMap]()
     parameters = objective.parameters
     for number, block in enumerate(parameters.blocks):
-        if block.cause != FIELD:
+        if not block.mapped:
             continue
         state, own = block.states[0], parameters.columns(number)
         model = objective.states[state].model

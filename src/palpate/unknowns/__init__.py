@@ -4,9 +4,7 @@ from palpate.unknowns.arrowhead import Arrowhead as Arrowhead
 from palpate.unknowns.arrowhead import Places as Places
 from palpate.unknowns.blocks import FIELD as FIELD
 from palpate.unknowns.blocks import KNOWN_MODULUS as KNOWN_MODULUS
-from palpate.unknowns.blocks import LAYER as LAYER
 from palpate.unknowns.blocks import PATCHINESS as PATCHINESS
-from palpate.unknowns.blocks import POISSON as POISSON
 from palpate.unknowns.blocks import Acts as Acts
 from palpate.unknowns.blocks import Alternative as Alternative
 from palpate.unknowns.blocks import Block as Block

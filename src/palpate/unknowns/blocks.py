@@ -139,7 +139,17 @@ class Block:
     @property
     def sought(self) -> bool:
         """Whether it is a Poisson's ratio that is to be found."""
-        return self.cause == POISSON and bool(self.mean)
+        return self.acts is Acts.MATERIAL and bool(self.mean)
+
+    @property
+    def moves_driver(self) -> bool:
+        """Whether its unknowns move a driver's wall."""
+        return self.acts is Acts.BOUNDARY and self.choice is not Choice.FRAME
+
+    @property
+    def mapped(self) -> bool:
+        """Whether it is the field of ln E of a tissue that is mapped."""
+        return self.cause == FIELD
 
     @property
     def widest(self) -> NDArray[np.float64]:

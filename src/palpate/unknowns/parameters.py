@@ -14,7 +14,7 @@ from scipy import linalg
 from palpate.errors import ConfigurationError
 from palpate.images.tissue import Role, Tissue
 from palpate.unknowns.arrowhead import Arrowhead, Places
-from palpate.unknowns.blocks import KNOWN_MODULUS, Acts, Alternative, Block, in_series, in_series_slopes
+from palpate.unknowns.blocks import Acts, Alternative, Block, Choice, in_series, in_series_slopes
 from palpate.unknowns.likelihood import Likelihood
 
 LOADS = "the known loads"
@@ -147,7 +147,11 @@ class ParameterMap:
 
     def reference_shift(self, unknowns: NDArray[np.float64]) -> float:
         """By how much ln E of the tissue that holds the scale differs from what is given at unknowns (n_unknowns,)."""
-        own = [i for i, b in enumerate(self.blocks) if b.cause == KNOWN_MODULUS and b.of == self.relative_to]
+        own = [
+            i
+            for i, b in enumerate(self.blocks)
+            if b.choice is Choice.NONE and b.acts is Acts.MODULI and b.of == self.relative_to
+        ]
         return sum(float(unknowns[self.columns(i)].sum()) for i in own)
 
     def in_words(self, unknowns: NDArray[np.float64]) -> str:
