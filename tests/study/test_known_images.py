@@ -68,6 +68,14 @@ def added(inputs, earlier) -> Path:
     return earlier / "added-after_3"
 
 
+@pytest.fixture(scope="module")
+def problem(inputs):
+    """The inverse problem of the case, and its mesh."""
+    case = palpate.read_case(inputs / "case.toml")
+    body = make_body(read_states(case), case, progress=silent)
+    return joint_problem((body,), case, progress=silent), body.space.mesh
+
+
 def document(folder: Path):
     return json.loads((folder / "result.json").read_text())
 
@@ -172,11 +180,10 @@ def known_of(folder: Path) -> KnownImages:
         ({"marks": np.ones(3)}, r"the 3 modes of tissues and drawing come out otherwise"),
     ],
 )
-def test_what_another_body_has_told_is_refused(inputs, earlier, change, words):
-    case = palpate.read_case(inputs / "case.toml")
-    body = make_body(read_states(case), case, progress=silent)
-    problem, known = joint_problem((body,), case, progress=silent), known_of(earlier)
-    assert digest_of(body.space.mesh) == known.mesh
+def test_what_another_body_has_told_is_refused(inputs, problem, earlier, change, words):
+    case, known = palpate.read_case(inputs / "case.toml"), known_of(earlier)
+    problem, mesh = problem
+    assert digest_of(mesh) == known.mesh
     assert known.problem_with(problem, case).parameters.earlier
     with pytest.raises(ConfigurationError, match=words):
         replace(known, **change).problem_with(problem, case)
