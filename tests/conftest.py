@@ -227,7 +227,7 @@ TESTS = Path(__file__).parent
 # layer has others. They come first, the longest before all, so that no processor waits for another at the end.
 SLOW = (TESTS / "slow.txt").read_text(encoding="utf-8").split()
 # Tests of over seven seconds each: whole documents, repeated experiments. `make acceptance` runs them, not `make test`.
-ACCEPTANCE = tuple(f"tests/{entry}" for entry in (TESTS / "acceptance.txt").read_text(encoding="utf-8").split())
+ACCEPTANCE = tuple(f"tests/{entry}" for entry in (TESTS / "acceptance.txt").read_text(encoding="utf-8").splitlines())
 
 
 def pytest_collection_finish():

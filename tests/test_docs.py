@@ -116,7 +116,7 @@ def test_every_path_that_newcomers_are_told_is_there():
     assert [name for name in sorted(named) if not any((place / name).exists() for place in places)] == []
 
 
-@pytest.mark.parametrize("entry", (ROOT / "tests" / "acceptance.txt").read_text(encoding="utf-8").split())
+@pytest.mark.parametrize("entry", (ROOT / "tests" / "acceptance.txt").read_text(encoding="utf-8").splitlines())
 def test_what_the_acceptance_lists_is_a_test(entry):
     path, _, name = entry.partition("::")
     assert f"def {name.partition('[')[0]}" in (ROOT / "tests" / path).read_text(encoding="utf-8")

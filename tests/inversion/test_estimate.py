@@ -20,7 +20,7 @@ from palpate.inversion import (
     searched,
 )
 from palpate.observation.noise_model import NoiseModel
-from palpate.statement.conclude import Observed, conclude
+from palpate.statement.conclusion import Observed, conclude
 from palpate.uncertainty import FittedState, sandwich_covariance
 
 SHARP = NoiseModel(np.array([1e-6]), np.array([3.0]))

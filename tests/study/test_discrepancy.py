@@ -12,7 +12,7 @@ from palpate.observation.surface_distance import surface_distance
 from palpate.observation.target import surface_target
 from palpate.statement.discrepancy import FoundDiscrepancy, OffsetFound, discrepancy_findings, discrepancy_of
 from palpate.uncertainty import FittedState
-from palpate.unknowns import offset_block, parameter_map, unit_blocks
+from palpate.unknowns import Choice, offset_block, parameter_map, unit_blocks
 
 DRAWN_MM = 0.6
 
@@ -24,7 +24,7 @@ def inversion(twins, twin):
     before, after = targets[0].voxels
     targets[0] = surface_target(twin.surfaces[0], before, after.shifted(-DRAWN_MM))
     seen, model = tuple(surface_distance(target) for target in targets), twin.model
-    blocks = [replace(block, cause="frame", unit_mm=2.0) for block in unit_blocks(model.n_modes)]
+    blocks = [replace(block, cause="frame", choice=Choice.FRAME, unit_mm=2.0) for block in unit_blocks(model.n_modes)]
     blocks += [offset_block(o, 0, sd=0.5) for o in seen if not o.of_driver]
     mapping = parameter_map(twin.scene.tissues, model.regions, blocks)
     problem = InverseProblem((LaterState(model, seen),), mapping)

@@ -13,7 +13,7 @@ from palpate.images.tissue import Role
 from palpate.inversion import REPORTED, Explanation, Inversion, Mixture, Outcome, frozen_posterior, gauss_newton, invert
 from palpate.mechanics.forward import SolveCounts
 from palpate.observation.noise_model import NoiseModel
-from palpate.statement.conclude import Observed, conclude
+from palpate.statement.conclusion import Observed, conclude
 from palpate.statement.samples import draw_moduli
 from palpate.statement.stated_posterior import as_stated, profiled
 from palpate.statement.verdicts import estimates_of, intervals_of, or_as_ratio, verdict

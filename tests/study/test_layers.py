@@ -16,7 +16,7 @@ from palpate.observation.observed_surface import observed_surface
 from palpate.observation.prescribed_motion import prescribed_motion
 from palpate.observation.surface_distance import surface_distance
 from palpate.phantoms.scene import Scene
-from palpate.statement.conclude import Observed, conclude
+from palpate.statement.conclusion import Observed, conclude
 from palpate.statement.discrepancy import discrepancy_findings, discrepancy_of, fitted_materials
 from palpate.uncertainty import FittedState
 from palpate.uncertainty.profile import Ray

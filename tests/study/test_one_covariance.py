@@ -10,7 +10,7 @@ import pytest
 from palpate.images.tissue import Role
 from palpate.inversion import invert
 from palpate.observation.noise_model import NoiseModel
-from palpate.statement.conclude import Observed, conclude
+from palpate.statement.conclusion import Observed, conclude
 from palpate.uncertainty import FittedState
 from palpate.uncertainty.intervals import NORMAL_95
 from palpate.uncertainty.profile import JOINT_LEVEL

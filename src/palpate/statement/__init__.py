@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from palpate.front_door import front_door
 
 if TYPE_CHECKING:
-    from palpate.statement.conclude import Observed as Observed
-    from palpate.statement.conclude import conclude as conclude
+    from palpate.statement.conclusion import Observed as Observed
+    from palpate.statement.conclusion import conclude as conclude
     from palpate.statement.stated_posterior import as_stated as as_stated
     from palpate.statement.verdicts import estimates_of as estimates_of
     from palpate.statement.verdicts import intervals_of as intervals_of

@@ -27,7 +27,7 @@ from palpate.mechanics.dilatation import choose_element
 from palpate.mechanics.laws.registry import law_named
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Forecast, Line, Progress, counted, during, silent
-from palpate.statement.conclude import Observed, conclude
+from palpate.statement.conclusion import Observed, conclude
 from palpate.statement.estimation import Estimation
 from palpate.statement.known_images import Added, KnownImages, why_together
 from palpate.statement.plausibility import estimate_warnings, unit_warnings

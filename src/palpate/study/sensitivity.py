@@ -38,7 +38,7 @@ from palpate.inversion import Inversion, InversionSettings, StopRule
 from palpate.mechanics.dilatation import choose_element
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Line, Progress, details, silent
-from palpate.statement.conclude import conclude
+from palpate.statement.conclusion import conclude
 from palpate.statement.result import Provenance, closing, json_object
 from palpate.statement.variations import Variation, fast_variations, voxel_mm
 from palpate.study.case_inversion import invert_case
