@@ -50,6 +50,7 @@ from palpate.observation import (
     PointTable,
     correlation,
     observed_surface,
+    stated_sd,
 )
 from palpate.phantoms import (
     AffineMotion,
@@ -867,7 +868,7 @@ def point_term(
     """The term of displacements (n, 3) mm at places (n, 3) mm: of a field where errors are alike over a length."""
     kind = "displacement-field" if length_mm else "landmarks"
     file = DataFile(kind, kind, (Path("simulated.csv"),), 1, sd_mm, correlation_mm=length_mm)
-    table = PointTable(places, places + moved, ("",) * len(places), ())
+    table = PointTable(places, places + moved, stated_sd(file, len(places)), ("",) * len(places), ())
     source = DisplacementField(file, table) if length_mm else Landmarks(file, table)
     return source.on(space, _no_reaction)[0]
 

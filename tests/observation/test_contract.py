@@ -20,6 +20,7 @@ from palpate.observation.force import Force
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.observed_surface import ObservedSurface
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
+from palpate.observation.point_table import PointTable, stated_sd
 from palpate.observation.stated_noise import stated_noise
 from palpate.observation.surface_distance import SurfaceDistance, surface_distance
 from palpate.observation.target import surface_target, target_from
@@ -93,7 +94,8 @@ def of_points(_sphere, _point_motion, *, file=FIELD, cells=None):
     moved = 0.5 * rng.standard_normal((40, 3))
     places = located(space.mesh, points)
     assert places.inside.all()
-    return point_displacement(space, points, moved, places, file=file, description="points", cells=cells)
+    table = PointTable(points, points + moved, stated_sd(file, len(points)), ("",) * len(points), ())
+    return point_displacement(space, table, places, file=file, description="points", cells=cells)
 
 
 def of_markers(sphere, point_motion):

@@ -183,7 +183,6 @@ def test_a_field_that_leads_back_is_refused(case, folder):
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("data=[{kind='landmarks', file='markers.csv'}]", "no stated error"),
         ("data=[{kind='landmarks', file='markers.csv', sd_mm=0.1, state=2}]", "has 1 later state"),
         ("data=[{kind='landmark', file='markers.csv', sd_mm=0.1}]", "did you mean"),
         (

@@ -14,6 +14,7 @@ from palpate.mesh.locate import located
 from palpate.observation.contract import DataFile, Fit, Residuals, Weighting
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.point_displacement import point_displacement
+from palpate.observation.point_table import PointTable, stated_sd
 from palpate.observation.robust_loss import PowerLaw
 from palpate.statement.estimation import PointFit
 from palpate.statement.misfit import beside_misfits, misfits_of
@@ -62,7 +63,8 @@ def measured(case_result):
         mask = np.isin(np.arange(len(points)), inside)
         file = DataFile("displacement-field", "field", (Path("f.csv"),), 1, **({"sd_mm": SD} | stated))
         labels = tuple(f"bead-{k + 1}" for k in range(n)) if labelled else ()
-        shown = points[mask], np.zeros((n, 3)), places.of(mask)
+        table = PointTable(points[mask], points[mask], stated_sd(file, n), ("",) * n, ())
+        shown = table, places.of(mask)
         return Measured(point_displacement(space, *shown, file=file, description="", labels=labels), points[mask])
 
     return of

@@ -18,6 +18,7 @@ from palpate.observation.contract import DataFile, Residuals, Weighting, seen_by
 from palpate.observation.jacobian import Jacobian
 from palpate.observation.noise_model import NoiseModel
 from palpate.observation.point_displacement import point_displacement
+from palpate.observation.point_table import PointTable, stated_sd
 from palpate.observation.robust_loss import PowerLaw
 from palpate.observation.surface_distance import SurfaceDistance
 from palpate.phantoms.motion import smooth_field
@@ -123,7 +124,8 @@ def test_points_tell_what_their_stated_covariance_leaves(limits, smooth):
     root = rng.normal(size=(3, 3))
     file = DataFile("landmarks", "landmarks", (), 1, 0.4, covariance_mm2=root @ root.T + 0.1 * np.eye(3))
     places = located(space.mesh, points)
-    term = point_displacement(space, points, np.zeros((20, 3)), places, file=file, description="")
+    table = PointTable(points, points, stated_sd(file, 20), ("",) * 20, ())
+    term = point_displacement(space, table, places, file=file, description="")
     told = Jacobian.of(term.whitening @ seen_by(term, tangent))
     doubtful = term.with_noise(NoiseModel(np.array([4.0]), np.array([1.0])))
     line = Linearisation(doubtful, 0, None, np.arange(5), told, np.full(60, 1.0 / 60.0), None, None)

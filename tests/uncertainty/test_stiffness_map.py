@@ -18,7 +18,7 @@ from palpate.mechanics.laws.neo_hookean import NeoHookean
 from palpate.mechanics.linear_model import linear_model
 from palpate.mechanics.material import MaterialModes, material_modes
 from palpate.mesh.locate import located, point_interpolation
-from palpate.observation import DataFile, DisplacementField, PointTable
+from palpate.observation import DataFile, DisplacementField, PointTable, stated_sd
 from palpate.uncertainty import NORMAL_95, sandwich_covariance, stiffness_maps
 from palpate.unknowns import material_blocks, parameter_map, unit_blocks
 
@@ -48,7 +48,9 @@ def observed(body, displacement, rng, sd_mm=SD_MM):
     moved = point_interpolation(space, located(space.mesh, places)) @ displacement
     moved = moved + sd_mm * rng.normal(size=moved.shape)
     file = DataFile("field", "displacement-field", (Path("simulated.csv"),), 1, sd_mm)
-    return DisplacementField(file, PointTable(places, places + moved, ("",) * len(places), ())).on(space, no_force)[0]
+    return DisplacementField(
+        file, PointTable(places, places + moved, stated_sd(file, len(places)), ("",) * len(places), ())
+    ).on(space, no_force)[0]
 
 
 def mapped(twins, twin, body, displacement, rng, sd_mm=SD_MM, law=None):

@@ -35,7 +35,9 @@ class CaseData:
     """Measurements beside the images, of the later state with the number `state`; `file_after`: of a second list.
 
     `sd_mm`: standard deviation of each component's error, or `covariance_mm2` (3, 3) of a point's; `correlation_mm`:
-    length over which a field's errors are alike; `axes`: of a field's vectors, where its file does not tell. A force
+    length over which a field's errors are alike; `subset_mm`: edge of the box whose motion each
+    displacement is, by digital volume correlation; by default, what the file says. `frame`: which field of a file of
+    several, by default that of its state; `axes`: of a field's vectors, where its file does not tell. A force
     has no file: `force_n` on `surface` (see `CaseLoad`) along `direction`, with `sd_n` and that of the load cell's
     offset, `offset_sd_n`.
     """
@@ -46,7 +48,9 @@ class CaseData:
     state: int = field(default=1, metadata=rule(between=(1, 1000)))
     sd_mm: float | None = field(default=None, metadata=rule(between=(1e-6, 100.0)))
     covariance_mm2: tuple[Row, Row, Row] | None = field(default=None, metadata=COVARIANCE)
-    correlation_mm: float = field(default=0.0, metadata=rule(between=(0.0, 1e3)))
+    correlation_mm: float | None = field(default=None, metadata=rule(between=(0.0, 1e3)))
+    subset_mm: float | None = field(default=None, metadata=rule(between=(0.0, 1e3)))
+    frame: int | None = field(default=None, metadata=rule(between=(1, 100_000)))
     axes: str | None = field(default=None, metadata=rule(choices=("LPS", "RAS")))
     surface: str | None = None
     force_n: float | None = field(default=None, metadata=rule(between=FORCES_N))
@@ -57,11 +61,6 @@ class CaseData:
     def __post_init__(self) -> None:
         kind = SOURCES[self.kind]
         _check_keys(self, "[[data]]", kind.needs, kind.may_have)
-        if self.file is not None and self.sd_mm is None and self.covariance_mm2 is None:
-            raise ConfigurationError(
-                f"[[data]] '{self.file.name}' has no stated error: give sd_mm, the standard deviation of one component"
-                " in mm"
-            )
 
     @property
     def tells_scale(self) -> bool:
@@ -72,8 +71,9 @@ class CaseData:
         """What the layers below are told of it, under a name of its term."""
         matrix = None if self.covariance_mm2 is None else np.array(self.covariance_mm2)
         paths = tuple(path for path in (self.file, self.file_after) if path is not None)
-        sd_mm = self.sd_mm or float(np.sqrt(np.trace(np.eye(3) if matrix is None else matrix) / 3.0))
-        errors = (sd_mm, matrix, self.correlation_mm, self.axes or "")
+        sd_mm = self.sd_mm if matrix is None else float(np.sqrt(np.trace(matrix) / 3.0))
+        edges = None if self.subset_mm is None else (self.subset_mm, self.subset_mm, self.subset_mm)
+        errors = (sd_mm, matrix, self.correlation_mm, edges, self.frame, self.axes or "")
         force = (self.surface or "", self.force_n or 0.0, self.direction or (0.0, 0.0, 1.0), self.sd_n or 1.0)
         return DataFile(self.kind, name, paths, self.state, *errors, *force, self.offset_sd_n)
 

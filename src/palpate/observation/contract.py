@@ -357,17 +357,21 @@ class DataFile:
 
     state: number of the later state, from 1; sd_mm: standard deviation of each component's errors; covariance_mm2 (3,
     3): of a point's error instead; correlation_mm: length over which errors of a field are alike, exp(-d / length);
-    axes: of the vectors of a field, "LPS" or "RAS", "" where its file is to tell; force_n on a surface along a
-    direction, with its standard deviation and that of the load cell's offset, N.
+    subset_mm: edges along x, y and z of the box whose motion each displacement of a field is; None where the file is to
+    tell. frame: which field of a file of several, from 1; axes: of the vectors of a field, "LPS" or "RAS", "" where its
+    file is to tell; force_n on a surface along a direction, with its standard deviation and that of the load cell's
+    offset, N.
     """
 
     kind: str
     name: str
     paths: tuple[Path, ...]
     state: int
-    sd_mm: float = 1.0
+    sd_mm: float | None = None
     covariance_mm2: NDArray[np.float64] | None = None
-    correlation_mm: float = 0.0
+    correlation_mm: float | None = None
+    subset_mm: tuple[float, float, float] | None = None
+    frame: int | None = None
     axes: str = ""
     surface: str = ""
     force_n: float = 0.0

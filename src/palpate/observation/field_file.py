@@ -20,7 +20,7 @@ from palpate.images.readers.metaimage import metaimage_content
 from palpate.images.readers.nifti import nifti_affine, nifti_content, nifti_millimetres
 from palpate.images.readers.nrrd import MILLIMETRES, RAS_SIGNS, nrrd_content
 from palpate.images.readers.text_header import StoredArray
-from palpate.observation.measured_points import read_text
+from palpate.observation.point_table import read_text
 
 Field = tuple[NDArray[np.float64], VoxelGrid, tuple[str, ...]]
 MOST_VECTORS = 8 * 2**30 // 144  # 8 GiB in all, for a vector takes 144 bytes while it is read

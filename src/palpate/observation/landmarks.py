@@ -18,7 +18,8 @@ from palpate.findings import Finding, listing
 from palpate.images.label_image import LPS_TO_RAS
 from palpate.images.named_labels import printable
 from palpate.observation.contract import DataFile
-from palpate.observation.measured_points import MeasuredPoints, PointTable, checked_table, read_point_table, read_text
+from palpate.observation.measured_points import MeasuredPoints
+from palpate.observation.point_table import PointTable, checked_table, read_point_table, read_text, stated_sd
 
 Marks = list[tuple[str, NDArray[np.float64]]]  # labels and points, RAS mm, NaN of one that was not placed
 TO_RAS = {"LPS": LPS_TO_RAS, "RAS": np.ones(3), "1": LPS_TO_RAS, "0": np.ones(3)}
@@ -51,7 +52,7 @@ def read_landmarks(file: DataFile) -> Landmarks:
     Raises `InputDataError` for whatever is wrong.
     """
     if file.paths[0].suffix.lower() == ".csv" and len(file.paths) == 1:
-        return Landmarks(file, read_point_table(file.paths[0]))
+        return Landmarks(file, read_point_table(file))
     lists, digests = list[Marks](), list[str]()
     for path in file.paths:
         content, digest = read_text(path)
@@ -75,7 +76,8 @@ def read_landmarks(file: DataFile) -> Landmarks:
     text = listing(lead, _quoted(list(left)), ". Place them in both lists, with the same label.")
     findings = (Finding("points-unpaired", text, place=f"in state {file.state}"),) if left else ()
     names = tuple(first[n] for n in pairs[:, 0])
-    table = PointTable(before[pairs[:, 0]], after[pairs[:, 1]], names, tuple(digests), findings)
+    sd = stated_sd(file, len(pairs))
+    table = PointTable(before[pairs[:, 0]], after[pairs[:, 1]], sd, names, tuple(digests), findings)
     return Landmarks(file, checked_table(table, file.paths[0]))
 
 

@@ -43,7 +43,7 @@ class MeasuredMotion:
         map's slope across it at 0.
         """
         before, moved = self.before, np.concatenate([source.table.moved for source in self.sources])
-        sd_mm = np.concatenate([np.full(len(source.table.before), source.file.sd_mm) for source in self.sources])
+        sd_mm = np.concatenate([np.sqrt(np.mean(source.table.sd**2, axis=1)) for source in self.sources])
         mean = before.mean(axis=0)
         terms = [np.concatenate([x - mean, np.ones((len(x), 1))], axis=1) for x in (before, points)]
         slopes, *_ = np.linalg.lstsq(terms[0], moved, rcond=FLAT)

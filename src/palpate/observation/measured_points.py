@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
@@ -15,25 +13,18 @@ from scipy.ndimage import map_coordinates
 from palpate.errors import InputDataError
 from palpate.findings import Finding
 from palpate.images.alignment import RigidMotion
-from palpate.images.input_file import whole_input
 from palpate.images.label_image import LPS_TO_RAS
-from palpate.images.named_labels import printable
 from palpate.images.segmentation import Segmentation
 from palpate.mesh.locate import located
 from palpate.mesh.space import LagrangeSpace
 from palpate.mesh.tet_mesh import TetMesh
 from palpate.observation.contract import DataFile, ReactionOf
 from palpate.observation.point_displacement import PointDisplacement, point_displacement
+from palpate.observation.point_table import MOST_POINTS, PointTable
 
-MOST_BYTES = 64 * 2**20
-COLUMNS = tuple(f"{when}_{axis}" for when in ("before", "after") for axis in "xyz")
-FARTHEST = 1e9  # mm
+ALIKE = 0.05  # of a standard deviation: less is told as one number
 SLIP = 0.5  # share of the points by which another reading must place more of them inside the mesh to be proposed
-MOST_POINTS = 20_000  # points whose direction or place is checked
 TELLING = 20  # least number of points at whose place the later image shows another tissue
-SEVERAL = 8  # least number of points that show how displacements change in space
-STRETCH = 0.5  # mm per mm in every direction, more than in any body
-FLAT = 1e-6  # of the points' extent
 NEAR = 0.1  # of the body's largest distance from the origin: a reading with all points nearer to it is no evidence
 CLEARLY = 0.4  # share of the points by which another reading must agree better
 PLACES = {  # of points that were written otherwise, by what turns them
@@ -48,25 +39,6 @@ MOTIONS = {
     "in LPS where RAS is read, or the other way round: write tables in RAS, and state the axes of an image": LPS_TO_RAS,
     "from the later state to the first, and in LPS where RAS is read, or the other way round": -LPS_TO_RAS,
 }
-
-
-@dataclass(frozen=True, slots=True)
-class PointTable:
-    """Pairs of points (n, 3) RAS mm, before and after; names (n,), which may be empty; digests of the files.
-
-    `pairing`: what is to be said of how they were paired.
-    """
-
-    before: NDArray[np.float64]
-    after: NDArray[np.float64]
-    names: tuple[str, ...]
-    digests: tuple[str, ...]
-    pairing: tuple[Finding, ...] = ()
-
-    @property
-    def moved(self) -> NDArray[np.float64]:
-        """Displacements (n, 3) mm."""
-        return np.asarray(self.after - self.before)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,13 +67,18 @@ class MeasuredPoints:
 
     @property
     def in_words(self) -> str:
-        """Number of pairs, and how far they move."""
+        """Number of pairs, how far they move, how large their errors are, and what was left out."""
         n, rms = len(self.table.before), np.sqrt(np.mean(np.sum(self.table.moved**2, axis=1)))
-        return f"{n} pair{'s' * (n > 1)} of points, moved by {rms:.2g} mm (root mean square)"
+        low, high = np.quantile(self.table.sd, (0.05, 0.95))
+        sd = f"{low:.2g}" if high - low < ALIKE * low else f"{low:.2g} to {high:.2g}"
+        told = f"{n} pair{'s' * (n > 1)} of points, moved by {rms:.2g} mm (root mean square), sd {sd} mm"
+        return "; ".join(part for part in (told, self.table.remark) if part)
 
     def brought(self, motion: RigidMotion) -> Self:
-        """The same with the later points moved back by the rigid motion of the later state."""
-        return replace(self, table=replace(self.table, after=motion.inverse().apply(self.table.after)))
+        """The same with the later points, and the axes of errors, moved back by the rigid motion of the later state."""
+        back = motion.inverse()
+        sd = np.sqrt(self.table.sd**2 @ (back.rotation**2).T)
+        return replace(self, table=replace(self.table, after=back.apply(self.table.after), sd=sd))
 
     def against(self, before: Segmentation, after: Segmentation) -> None:
         """Raise `InputDataError` where the displacements lead into the wrong tissues.
@@ -130,62 +107,8 @@ class MeasuredPoints:
         inside = places.inside
         _refuse_slips(space.mesh, before, inside, self.file.paths[0])
         (labels, findings), cells = self.named(inside), self.cells(space.mesh, before[inside])
-        pairs = (before[inside], self.table.moved[inside], places.of(inside))
-        return point_displacement(space, *pairs, self.file, self.description, cells=cells, labels=labels), findings
-
-
-def read_point_table(path: Path) -> PointTable:
-    """Read a table with the columns before_x ... after_z, RAS mm, and label, if it has one; `InputDataError`."""
-    content, digest = read_text(path)
-    lines, rows, labels = csv.DictReader(io.StringIO(content)), [], []
-    try:
-        lines.fieldnames = names = [name.strip().lower() for name in lines.fieldnames or ()]
-        if missing := [name for name in COLUMNS if name not in names]:
-            raise InputDataError(
-                f"'{path}' lacks the column(s) {', '.join(missing)}; its first line needs {', '.join(COLUMNS)} (RAS mm)"
-            )
-        for line in lines:
-            rows.append([float(line[name] or "nan") for name in COLUMNS])
-            labels.append(printable((line.get("label") or "").strip()[:200]))
-    except (TypeError, ValueError, csv.Error) as error:
-        raise InputDataError(
-            f"line {lines.line_num} of '{path}' does not hold six numbers ({error}); correct it"
-        ) from error
-    values = np.array(rows, dtype=np.float64).reshape(-1, 2, 3)
-    return checked_table(PointTable(values[:, 0], values[:, 1], tuple(labels), (digest,)), path)
-
-
-def read_text(path: Path) -> tuple[str, str]:
-    """The text of a file of at most 64 MB, and its SHA-256; raises `InputDataError`."""
-    content, digest = whole_input(path, MOST_BYTES)
-    try:
-        return content.decode("utf-8-sig"), digest
-    except UnicodeDecodeError as error:
-        raise InputDataError(f"'{path}' is not UTF-8 text ({error}); export it as UTF-8") from error
-
-
-def checked_table(table: PointTable, path: Path) -> PointTable:
-    """The table itself, if it has points, all of them numbers, that move as a body does; raises `InputDataError`."""
-    if len(table.before) == 0:
-        raise InputDataError(f"'{path}' holds no pair of points; export it with at least one")
-    bad = np.flatnonzero(~(np.abs(np.concatenate([table.before, table.after], axis=1)) < FARTHEST).all(axis=1))
-    if len(bad):
-        raise InputDataError(
-            f"{len(bad)} pairs of '{path}', the first {bad[0] + 1}, have no number, or coordinates beyond any body;"
-            " remove them"
-        )
-    if np.array_equal(table.before, table.after):
-        raise InputDataError(f"the points of '{path}' did not move at all; give those of a later state")
-    step = -(-len(table.before) // MOST_POINTS)
-    points, moved = (values[::step] - values.mean(axis=0) for values in (table.before, table.moved))
-    slopes = np.linalg.lstsq(points, moved, rcond=FLAT)[0]  # 0 across points that lie in a plane
-    least = float(np.linalg.svd(slopes)[1][-1])
-    if len(points) >= SEVERAL and least > STRETCH:  # a rotation leaves its axis where it is
-        raise InputDataError(
-            f"the displacements of '{path}' change by {least:.2g} mm per mm or more in every direction, which is"
-            " impossible for a body: they may be positions, in another unit, or of other points; correct the file"
-        )
-    return table
+        seen = (self.table.where(inside), places.of(inside))
+        return point_displacement(space, *seen, self.file, self.description, cells=cells, labels=labels), findings
 
 
 def _refuse_slips(mesh: TetMesh, points: NDArray[np.float64], inside: NDArray[np.bool_], path: Path) -> None:

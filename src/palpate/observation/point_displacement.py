@@ -12,7 +12,9 @@ from palpate.mesh.locate import Places, point_interpolation
 from palpate.mesh.space import LagrangeSpace
 from palpate.observation.contract import DataFile, PointMotions, Residuals
 from palpate.observation.noise_model import whitener
+from palpate.observation.point_table import PointTable
 from palpate.observation.stated_noise import StatedNoise, stated_noise
+from palpate.observation.subset_mean import subset_mean
 
 TOGETHER = 6  # largest number of points in a cell's mean where their errors are correlated
 
@@ -50,8 +52,7 @@ class PointDisplacement(StatedNoise):
 
 def point_displacement(
     space: LagrangeSpace,
-    points: NDArray[np.float64],
-    moved: NDArray[np.float64],
+    table: PointTable,
     places: Places,
     file: DataFile,
     description: str,
@@ -59,46 +60,62 @@ def point_displacement(
     cells: NDArray[np.int64] | None = None,
     labels: tuple[str, ...] = (),
 ) -> PointDisplacement:
-    """The term of points (n, 3) mm at rest, inside the mesh at `places`, that were measured to move by (n, 3) mm.
+    """The term of the measured points of a table, which lie inside the mesh at `places`.
 
-    file: what is stated of their errors; cells (n, k): what the points of one mean have in common, by default each
-    stands alone; labels (n,): names of points that stand alone.
+    file: what is stated of their errors beside the table; cells (n, k): what the points of one mean have in common, by
+    default each stands alone; labels (n,): names of points that stand alone.
     """
-    number = np.arange(len(points)) if cells is None else np.unique(cells, axis=0, return_inverse=True)[1].ravel()
-    mean, mixed = _means(points, number, file.correlation_mm)
-    of_nodes, n = sparse.csr_matrix(mean @ point_interpolation(space, places)), mean.shape[0]
+    number = np.arange(len(table.before)) if cells is None else np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    mean, sd, mixed = _means(table, number, file.correlation_mm or 0.0)
+    of_nodes, n = sparse.csr_matrix(mean @ _interpolation(space, table, places, file, mean)), mean.shape[0]
     seen = np.unique(of_nodes.indices)
+    usual = float(np.mean(table.sd**-2.0) ** -0.5)  # of equal errors that tell as much
     apart = np.eye(3)
-    if file.covariance_mm2 is not None:
-        apart = file.sd_mm * np.linalg.inv(np.linalg.cholesky(file.covariance_mm2))
+    if file.covariance_mm2 is not None:  # of all points
+        apart = usual * np.linalg.inv(np.linalg.cholesky(file.covariance_mm2))
     return PointDisplacement(
         file.name,
-        *stated_noise(file.sd_mm, 3 * n),
+        *stated_noise(usual, 3 * n),
         description=description,
         dofs=(3 * seen[:, None] + np.arange(3)).ravel(),
         interpolation=sparse.csr_matrix(sparse.kron(of_nodes[:, seen], sparse.eye_array(3))),
-        measured=np.asarray(mean @ moved).ravel(),
-        whitening=sparse.csr_matrix(sparse.kron(mixed, apart)),
-        material=np.repeat(np.asarray(mean @ points), 3, axis=0),
+        measured=np.asarray(mean @ table.moved).ravel(),
+        whitening=sparse.csr_matrix(sparse.kron(mixed, apart) @ sparse.diags_array(usual / sd.ravel())),
+        material=np.repeat(np.asarray(mean @ table.before), 3, axis=0),
         labels=labels,
     )
 
 
-def _means(
-    points: NDArray[np.float64], number: NDArray[np.int64], length: float
-) -> tuple[sparse.csr_matrix[np.float64], sparse.csr_matrix[np.float64]]:
-    """Means (n_cells, n) of points (n, 3) mm by the number (n,) of their cell, and what makes these independent.
+def _interpolation(
+    space: LagrangeSpace, table: PointTable, places: Places, file: DataFile, mean: sparse.csr_matrix[np.float64]
+) -> sparse.csr_matrix[np.float64]:
+    """What is measured at each point that has a share in a mean: the displacement there, or that of a subset."""
+    if not file.subset_mm:
+        return point_interpolation(space, places)
+    taken = np.isin(np.arange(len(table.before)), mean.indices)
+    of_taken = subset_mean(space, table.before[taken], places.of(taken), np.array(file.subset_mm))
+    return sparse.csr_matrix(sparse.eye_array(len(taken), format="csc")[:, taken] @ of_taken)
 
-    Where errors are correlated over a length (mm), a few points of each cell tell nearly as much as all.
+
+def _means(
+    table: PointTable, number: NDArray[np.int64], length: float
+) -> tuple[sparse.csr_matrix[np.float64], NDArray[np.float64], sparse.csr_matrix[np.float64]]:
+    """Means (n_cells, n) of points by the number (n,) of their cell, weighted by the inverse squares of their errors.
+
+    With the standard deviations (n_cells, 3) mm of their errors, and what makes these independent. Where errors are
+    correlated over a length (mm), a few points of each cell tell nearly as much as all, and the error is that of one.
     """
-    counts = np.bincount(number)
-    if length <= 0.0:
-        shares = (1.0 / counts[number], (number, np.arange(len(number))))
-        alone = sparse.csr_matrix(sparse.diags_array(np.sqrt(counts.astype(np.float64))))
-        return sparse.csr_matrix(shares, shape=(len(counts), len(points))), alone
-    order, k = np.argsort(number, kind="stable"), min(TOGETHER, int(counts.max()))
-    starts = np.cumsum(counts) - counts
-    spread = np.arange(k) / max(k - 1, 1)  # over the cell's points; with fewer, some are taken twice
-    groups = order[starts[:, None] + np.rint(spread * (counts[:, None] - 1)).astype(np.int64)]
-    entries = (np.full(groups.size, 1.0 / k), (np.repeat(np.arange(len(groups)), k), groups.ravel()))
-    return sparse.csr_matrix(entries, shape=(len(groups), len(points))), whitener(points[groups], length)
+    counts, members, row = np.bincount(number), np.arange(len(number)), number
+    k = 1
+    if length > 0.0:
+        order, k = np.argsort(number, kind="stable"), min(TOGETHER, int(counts.max()))
+        starts = np.cumsum(counts) - counts
+        spread = np.arange(k) / max(k - 1, 1)  # over the cell's points; with fewer, some are taken twice
+        members = order[starts[:, None] + np.rint(spread * (counts[:, None] - 1)).astype(np.int64)].ravel()
+        row = np.repeat(np.arange(len(counts)), k)
+    tells = 1.0 / np.mean(table.sd[members] ** 2, axis=1)
+    mean = sparse.csr_matrix((tells / np.bincount(row, tells)[row], (row, members)), shape=(len(counts), len(number)))
+    if length > 0.0:
+        return mean, np.asarray(mean @ table.sd), whitener(table.before[members].reshape(-1, k, 3), length)
+    alone = sparse.csr_matrix(sparse.eye_array(len(counts)))
+    return mean, np.sqrt(mean.power(2) @ table.sd**2), alone

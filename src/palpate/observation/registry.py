@@ -35,7 +35,7 @@ class SourceKind:
 
 SOURCES = {
     "landmarks": SourceKind(read_landmarks),
-    "displacement-field": SourceKind(read_displacement_field),
+    "displacement-field": SourceKind(read_displacement_field, may_have=(*OF_POINTS, "subset_mm", "frame")),
     "force": SourceKind(
         ForceMeasurement, ("surface", "force_n", "direction", "sd_n"), ("offset_sd_n",), tells_scale=True
     ),

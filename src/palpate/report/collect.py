@@ -192,7 +192,8 @@ def _brought(case: Case) -> list[tuple[str, str]]:
         where = f" on {load.surface}" if load.surface else ""
         found.append(("known load", f"{words}{where}{'' if load.state is None else when}"))
     for data in case.data:
-        error = "with a covariance" if data.sd_mm is None else f"sd {data.sd_mm:g} mm"
+        of_file = "with a covariance" if data.covariance_mm2 else "with the errors of its file"
+        error = of_file if data.sd_mm is None else f"sd {data.sd_mm:g} mm"
         alike = f", alike over {data.correlation_mm:g} mm" if data.correlation_mm else ""
         words = f"{data.kind}, {error}{alike}"
         if data.force_n is not None:
