@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from palpate.body.imaged import aligned
 from palpate.case.case import Case, CaseTissue, Discrepancy, DriverMotion, Images, Mechanics, MeshSettings, Noise
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
+from palpate.observation import DataFile, Landmarks, PointTable, stated_sd
 from palpate.progress import silent
 from palpate.study.prediction import predicted_intervals
 from palpate.study.run import estimate_states
@@ -117,3 +118,33 @@ def test_a_prediction_is_near_what_the_estimate_then_says(states, prediction_of)
     sd = np.sqrt(np.diag(told.covariance.total))
     ratio = widths(prediction_of()) / (2.0 * NORMAL_95 * sd)
     assert np.all((ratio > 0.5) & (ratio < 2.0))
+
+
+@pytest.fixture(scope="module")
+def worth_of(states):
+    """What each kind is worth, where points all over the body were measured with a standard deviation (mm) as well."""
+    body_of = partial(make_body, case=case_of(coarse_balls()), progress=silent)
+
+    def found(sd_mm):
+        scene = coarse_balls()
+        places, moved = scene.space.points[::7], scene.displacement[::7]
+        file = DataFile("landmarks", "landmarks", (Path("markers.csv"),), 1, sd_mm)
+        table = PointTable(places, places + moved, stated_sd(file, len(places)), ("",) * len(places), ())
+        body = body_of(replace(states, data=(Landmarks(file, table),)))
+        moduli = predicted_intervals([body], case_of(coarse_balls()), progress=silent).moduli
+        return np.array([[of.wider["surface distance"], of.wider["landmarks"]] for of in moduli])
+
+    return found
+
+
+def test_one_kind_of_data_has_no_worth_of_its_own(prediction_of):
+    assert [of.wider for of in prediction_of().moduli] == [{}, {}]
+
+
+def test_data_are_worth_what_they_tell_beside_the_others(worth_of):
+    """Points a thousand times worse than surfaces change nothing; the better they are, the less surfaces are worth."""
+    useless, good, best = (worth_of(sd) for sd in (1e3, 0.3, 0.03))
+    np.testing.assert_allclose(useless[:, 1], 1.0, atol=1e-3)
+    assert np.all(useless[:, 0] > 2.0)
+    assert np.all((best[:, 1] > good[:, 1]) & (good[:, 1] > 1.0))
+    assert np.all(best[:, 0] < good[:, 0])

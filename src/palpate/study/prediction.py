@@ -7,16 +7,20 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.body.body import Body, joint_problem, on_linear_elements
 from palpate.case.case import Case, Mechanics
-from palpate.inversion import first_noise_of, fit_coefficients
+from palpate.errors import EstimationError
+from palpate.inversion import Evaluation, Linearisation, Objective, first_noise_of, fit_coefficients
 from palpate.parallel import blas_on_one_thread
 from palpate.progress import Line, Progress
 from palpate.statement.verdicts import or_as_ratio, verdict, without_scale
 from palpate.study.run import inversion_settings
 from palpate.uncertainty import Interval, covariance_of, error_noise, log_interval
 from palpate.unknowns import KNOWN_MODULUS, Choice
+
+ONLY = 100.0  # times as wide: without this kind of data a modulus is not told
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +29,8 @@ class PredictedModulus:
 
     interval95: what would be left of it with all that is unknown; an open end (None) reaches beyond the bounds of the
     search; verdict: that which an estimate with this interval would have; shares: of each cause in the variance of
-    ln E; ratio, ratio_interval95: to `relative_to`, where the modulus of that is a range.
+    ln E; wider: by what factor the standard deviation of ln E would grow without each kind of data, where there are
+    several; ratio, ratio_interval95: to `relative_to`, where the modulus of that is a range.
     """
 
     tissue: str
@@ -38,6 +43,7 @@ class PredictedModulus:
     shares: Mapping[str, float] = field(default_factory=dict)
     ratio: float | None = None
     ratio_interval95: Interval | None = None
+    wider: Mapping[str, float] = field(default_factory=dict)
 
 
 def _ends(interval: Interval, unit: str) -> str:
@@ -47,6 +53,15 @@ def _ends(interval: Interval, unit: str) -> str:
         side = f"below {high:.3g} {unit}" if high is not None else f"above {low:.3g} {unit}" if low is not None else ""
         return side or "open at both ends"
     return f"{low:.3g} to {high:.3g} {unit}"
+
+
+def _without(wider: Mapping[str, float]) -> str:
+    """What each kind of data is worth, in words."""
+    told = [
+        f"no interval without {kind}" if w >= ONLY else f"{w:.2g} times as wide without {kind}"
+        for kind, w in wider.items()
+    ]
+    return "; " * bool(told) + ", ".join(told)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +86,7 @@ class Prediction:
             if of.verdict == "ratio only" and of.ratio is not None and of.ratio_interval95 is not None:
                 value, interval, unit = of.ratio, of.ratio_interval95, f"times {of.relative_to}"
             guess = f"predicted for {of.tissue}, if it has {value:.3g} {unit}"
-            lines.append(f"{guess}: 95 % interval {_ends(interval, unit)} ({of.verdict})")
+            lines.append(f"{guess}: 95 % interval {_ends(interval, unit)} ({of.verdict}){_without(of.wider)}")
         return lines
 
     def to_dict(self) -> dict[str, Any]:
@@ -93,10 +108,32 @@ class Prediction:
                     "ratio_interval95": of.ratio_interval95 and list(of.ratio_interval95),
                     "verdict": of.verdict,
                     "shares": dict(of.shares),
+                    "wider_without": {kind: round(w, 3) if w < ONLY else None for kind, w in of.wider.items()},
                 }
                 for of in self.moduli
             ],
         }
+
+
+def _wider(
+    objective: Objective, evaluation: Evaluation, unknowns: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
+    """By kind of data, factors (n_parameters,) by which the standard deviations of ln E grow without it.
+
+    By H^-1 of the others and the prior; nothing where there is one kind.
+    """
+    n, terms = objective.n_parameters, evaluation.linearisations
+    kinds = list(dict.fromkeys(term.observation.kind for term in terms))
+
+    def variances(kept: Sequence[Linearisation]) -> NDArray[np.float64]:
+        try:
+            return np.diag(objective.assembled(unknowns, kept).covariance_columns(n)[:n])
+        except EstimationError:
+            return np.full(n, np.inf)
+
+    every = variances(terms)
+    others = {kind: [term for term in terms if term.observation.kind != kind] for kind in kinds}
+    return {kind: np.sqrt(variances(kept) / every) for kind, kept in others.items() if kept}
 
 
 @blas_on_one_thread()
@@ -127,6 +164,7 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
     chosen = {i: believed[block.choice] for i, block in enumerate(blocks) if block.choice in believed}
     free = objective.with_prior(objective.parameters.choosing(chosen))
     found = covariance_of(free, fitted.evaluation.with_prior(free.parameters, fitted.unknowns), (), noise_of=noise_of)
+    wider = _wider(free, fitted.evaluation, fitted.unknowns)
     surfaces = [noise for (_, kind), noise in noise_of.items() if kind == "surface distance"]
     noise = surfaces[0] if surfaces else next(iter(noise_of.values()))
     mapping, moduli = objective.parameters, list[PredictedModulus]()
@@ -155,6 +193,7 @@ def predicted_intervals(bodies: Sequence[Body], case: Case, *, progress: Progres
                 shares,
                 value if as_ratio else None,
                 as_ratio,
+                {kind: float(factors[i]) for kind, factors in wider.items()},
             )
         )
     return Prediction(
