@@ -17,6 +17,9 @@ NAME is one of
             beads.npz. The modulus of the gel's inner part over that of the rest, which is 1, and the misfit. With
             --map the inner part's modulus is a field: how far it is from flat, beside its own intervals. --bead-sd
             (0.2) and --alike (0): standard deviation of the errors, and length over which they are alike, um.
+    skin    living human skin, and a keloid in it, pulled by two pads (Elouneg et al.). FOLDER holds monolithic.npz,
+            bimaterial.npz and their meshes. Moduli from field and force at a pull of --fit (1.0) mm; the forces at
+            pulls of --predict (2.0,3.0) mm follow. See measured_skin.py.
 
 Nothing of FOLDER is copied. Needs meshio: pip install 'palpate[mesh]'.
 """
@@ -35,6 +38,7 @@ from typing import Any
 import meshio
 import numpy as np
 from matplotlib.figure import Figure
+from measured_skin import plot_skin, skin
 from numpy.typing import NDArray
 
 from palpate.body import inverse_problem, make_body, read_states
@@ -76,8 +80,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=tuple(EXPERIMENTS))
     parser.add_argument("--data", type=Path, required=True, metavar="FOLDER")
-    parser.add_argument("--fit", default="2", help="steps, with commas")
-    parser.add_argument("--predict", default="1", help="steps, with commas; '' for none")
+    parser.add_argument("--fit", help="steps of tpu (2), or millimetres of pull of skin (1.0), with commas")
+    parser.add_argument("--predict", help="the same, of forces that follow (1; 2.0,3.0); '' for none")
     parser.add_argument("--foot", type=float, default=FOOT_N, help="sd (N) of the load cell's offset of tpu; 0: none")
     parser.add_argument("--map", action="store_true", help="map the inner part of beads")
     parser.add_argument("--bead-sd", type=float, default=BEAD_SD, help="sd (um) of the errors of beads")
@@ -86,13 +90,21 @@ def main() -> int:
     parser.add_argument("--plot", type=Path, metavar="FILE.svg", help="values with their 95 %% intervals")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        fit, predict = ([int(s) for s in text.split(",") if s] for text in (arguments.fit, arguments.predict))
+        usual = ("1.0", "2.0,3.0") if arguments.name == "skin" else ("2", "1")
+        asked = (
+            own if given is None else given
+            for given, own in zip((arguments.fit, arguments.predict), usual, strict=True)
+        )
+        fit, predict = ([float(s) for s in text.split(",") if s] for text in asked)
         options = Options(arguments.data, Path(folder), fit, predict, arguments.foot)
         options = replace(options, mapped=arguments.map, bead_sd=arguments.bead_sd, alike=arguments.alike)
         found = EXPERIMENTS[arguments.name](options)
     sys.stdout.write(json.dumps(found, indent=None if arguments.json else 1) + "\n")
     if arguments.plot:
-        _plot(arguments.name, found, arguments.plot)
+        if arguments.name == "skin":
+            plot_skin(arguments.data, found, arguments.plot)
+        else:
+            _plot(arguments.name, found, arguments.plot)
     return 0
 
 
@@ -105,8 +117,8 @@ class Options:
 
     data: Path
     folder: Path
-    fit: Sequence[int]
-    predict: Sequence[int]
+    fit: Sequence[float]
+    predict: Sequence[float]
     foot_n: float
     mapped: bool = False
     bead_sd: float = BEAD_SD
@@ -128,8 +140,8 @@ class Block:
     """Nodes (n, 3) mm, their motion (n, 3) mm by step, and the forces (N) that were measured."""
 
     nodes: Array
-    motion: dict[int, Array]
-    forces: dict[int, float]
+    motion: dict[float, Array]
+    forces: dict[float, float]
 
     @property
     def at_ends(self) -> NDArray[np.bool_]:
@@ -141,9 +153,13 @@ class Block:
 def _block(options: Options) -> Block:
     data, folder = options.data, options.folder
     nodes, tets = _table(data / "nodes_mm.csv"), _table(data / "tets.csv").astype(int)
-    steps = {int(path.stem.split("_")[1].removeprefix("step")): path for path in data.glob("displacement_step*_mm.csv")}
+    steps: dict[float, Path] = {
+        int(path.stem.split("_")[1].removeprefix("step")): path for path in data.glob("displacement_step*_mm.csv")
+    }
     meshio.write(folder / "block.vtu", meshio.Mesh(nodes, [("tetra", tets)]))
-    forces = {int(step): float(force) for step, force in np.atleast_2d(_table(data / "forces_n.csv"))}
+    forces: dict[float, float] = {
+        int(step): float(force) for step, force in np.atleast_2d(_table(data / "forces_n.csv"))
+    }
     return Block(nodes, {step: _table(path) for step, path in steps.items()}, forces)
 
 
@@ -161,11 +177,11 @@ def _tpu_case(folder: Path, law: str, element: str, data: Sequence[str]) -> Case
 
 
 def _tpu_data(
-    block: Block, folder: Path, step: int, state: int, *, force: tuple[float, float, float], ends: bool
+    block: Block, folder: Path, step: float, state: int, *, force: tuple[float, float, float], ends: bool
 ) -> str:
     """The [[data]] of one step; force: N, its standard deviation, that of its offset; ends: of the grips alone."""
     chosen = block.at_ends if ends else np.ones(len(block.nodes), dtype=bool)
-    name = f"step{step}{'_ends' if ends else ''}.csv"
+    name = f"step{step:g}{'_ends' if ends else ''}.csv"
     _pairs(folder / name, block.nodes[chosen], block.motion[step][chosen])
     newton, sd, offset = force
     return (
@@ -192,12 +208,12 @@ def _tpu_fit(block: Block, options: Options, law: str, element: str) -> dict[str
         "poisson_ratio": round(RATIO + _poisson_shift(inversion), 4),
         "law": law,
         "field_rms_mm": round(float(np.sqrt(np.mean(np.square(rms)))), 4),
-        "steps": list(steps),
+        "steps": list(map(int, steps)),
         "status": found.status,
     }
 
 
-def _tpu_prediction(block: Block, options: Options, step: int, fit: dict[str, Any]) -> dict[str, Any]:
+def _tpu_prediction(block: Block, options: Options, step: float, fit: dict[str, Any]) -> dict[str, Any]:
     """Force and field of a step by the motion of both ends, the modulus and its uncertainty those of the fit."""
     folder, unknown = (
         options.folder,
@@ -221,7 +237,7 @@ def _tpu_prediction(block: Block, options: Options, step: int, fit: dict[str, An
     off = np.linalg.norm((moved - block.motion[step])[inside], axis=1)
     motion = np.linalg.norm(block.motion[step][inside] - block.motion[step][inside].mean(axis=0), axis=1)
     return {
-        "step": step,
+        "step": int(step),
         "force_n": round(force, 1),
         "measured_n": block.forces.get(step),
         "interval95": [round(force - half, 1), round(force + half, 1)],
@@ -366,7 +382,12 @@ def _plot(name: str, found: dict[str, Any], path: Path) -> None:
     figure.savefig(path, metadata={"Date": None})
 
 
-EXPERIMENTS = {"tpu": tpu, "beam": beam, "beads": beads}
+def of_skin(options: Options) -> dict[str, Any]:
+    """Healthy skin, and a keloid over skin, by the largest pull of `fit`."""
+    return skin(options.data, max(options.fit), options.predict)
+
+
+EXPERIMENTS = {"tpu": tpu, "beam": beam, "beads": beads, "skin": of_skin}
 
 
 def _inverted(case: Case, *, prior: tuple[float, float] | None = None) -> Inversion:

@@ -295,7 +295,7 @@ def test_arrows_of_measured_points_are_drawn_asked_for_and_found(browser, case_r
     observed = np.tile([0.0, 3.0, 0.0], (60, 1))
     fitted = observed.copy()
     fitted[7] += [1.0, 0.0, 0.5]
-    fit = PointFit("landmarks", 0, PointMotions(rest, observed, fitted), 1.0)
+    fit = PointFit("landmarks", 0, PointMotions(rest, observed, fitted, np.tile(np.eye(3), (len(rest), 1, 1))), 1.0)
     estimation = dataclasses.replace(case_result.estimation, points=(fit,))
     complaints = []
     page = browser.new_page(viewport={"width": 390, "height": 900})

@@ -29,7 +29,9 @@ rng = np.random.default_rng(3)
 
 
 def fit_of(rest, observed, fitted, *, name="landmarks", state=0, labels=()):
-    return PointFit(name, state, PointMotions(rest, observed, fitted, labels), 1.0)
+    return PointFit(
+        name, state, PointMotions(rest, observed, fitted, np.tile(np.eye(3), (len(rest), 1, 1)), labels), 1.0
+    )
 
 
 def some_points(n, *, off=0.0):

@@ -56,14 +56,14 @@ def measured(case_result):
     """A function of how many points were measured, of what is stated of their errors, of what they are called."""
     space = case_result.space
 
-    def of(n, *, labelled=False, **stated):
+    def of(n, *, labelled=False, sd=None, **stated):
         points = np.random.default_rng(n).uniform(1.0, 39.0, (8 * n, 3))
         places = located(space.mesh, points)
         inside = np.flatnonzero(places.inside)[:n]
         mask = np.isin(np.arange(len(points)), inside)
         file = DataFile("displacement-field", "field", (Path("f.csv"),), 1, **({"sd_mm": SD} | stated))
         labels = tuple(f"bead-{k + 1}" for k in range(n)) if labelled else ()
-        table = PointTable(points[mask], points[mask], stated_sd(file, n), ("",) * n, ())
+        table = PointTable(points[mask], points[mask], stated_sd(file, n) if sd is None else sd, ("",) * n, ())
         shown = table, places.of(mask)
         return Measured(point_displacement(space, *shown, file=file, description="", labels=labels), points[mask])
 
@@ -97,6 +97,19 @@ def test_errors_of_a_covariance_that_is_stated_are_no_misfit(measured):
     (misfit,) = points.misfits(points.noise(1) @ root.T + across)
     assert misfit.times == pytest.approx(np.sqrt(1.0 + 0.5 * 10.0), rel=0.1)  # its variance over that along it
     assert np.dot(direction_in(misfit.text), [1.0, 1.0, 0.0]) > 0.9 * np.sqrt(2.0)
+
+
+@pytest.mark.parametrize("length", [0.0, 8.0])
+def test_errors_that_differ_by_point_and_component_are_no_misfit_and_hide_none(measured, length):
+    """As of cameras, which see no motion along z, and of points a hundred times worse than others."""
+    sd = SD * np.tile([[1.0, 1.0, 500.0], [100.0, 100.0, 500.0]], (60, 1))
+    points = measured(120, sd=sd, correlation_mm=length)
+    root = correlated(points.places, length) if length else np.eye(120)
+    errors = [sd / SD * (root @ points.noise(seed)) for seed in range(200)]
+    assert np.mean([bool(points.misfits(of)) for of in errors]) <= MOST_ALARMS
+    errors[0][:, 0] += 6.0 * SD
+    (misfit,) = points.misfits(errors[0])
+    assert misfit.times > 3.0
 
 
 @pytest.mark.parametrize("stated", [True, False])

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.errors import SolverError
 from palpate.inversion.frozen_posterior import Posterior
 from palpate.inversion.objective import Evaluation
 from palpate.inversion.optimise import Bounds, LeastSquares, Minimum, Outcome
@@ -273,10 +274,16 @@ class _Followed:
 
 
 def _covariance(there: Evaluation, numbers: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Of unknowns with these numbers (n,), all others at their best: (n, n), by the Gauss-Newton matrix."""
+    """Of unknowns with these numbers (n,), all others at their best: (n, n), by the Gauss-Newton matrix.
+
+    Raises `SolverError` where that is so near to singular that rounding leaves negative variances.
+    """
     unit = np.zeros((there.matrix.size, len(numbers)))
     unit[numbers, np.arange(len(numbers))] = 1.0
-    return np.asarray(there.matrix.grounded().solve(unit)[numbers])
+    found = np.asarray(there.matrix.grounded().solve(unit)[numbers])
+    if not (np.diag(found) > 0.0).all():
+        raise SolverError("the Gauss-Newton matrix is singular to rounding; the motion there is none of a body")
+    return found
 
 
 def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -270,12 +270,14 @@ class OfInstrument(Protocol):
 class PointMotions:
     """How points of the body move, which lie at `rest` (n, 3) RAS mm: `observed` and `fitted` displacements (n, 3) mm.
 
-    labels (n,): what the points are called; () where they have no names.
+    over_errors (n, 3, 3), 1/mm: what makes the components of a point's stated error independent, of variance 1; labels
+    (n,): what the points are called; () where they have no names.
     """
 
     rest: NDArray[np.float64]
     observed: NDArray[np.float64]
     fitted: NDArray[np.float64]
+    over_errors: NDArray[np.float64]
     labels: tuple[str, ...] = ()
 
 

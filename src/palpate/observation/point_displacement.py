@@ -24,7 +24,8 @@ class PointDisplacement(StatedNoise):
     """Residuals r = W (N u - d) of points with measured displacements d; implements `Observation`.
 
     interpolation: N (n, n_dofs) to the points, or to means of several; measured: d (n,) mm; whitening: W (n, n), which
-    makes their errors independent, each with the standard deviation stated. material (n, 3) mm: the point that a
+    makes their errors independent, each with one standard deviation; over_errors (n / 3, 3, 3), 1/mm: what makes the
+    components of a point's error independent, of variance 1. material (n, 3) mm: the point that a
     residual is of, along x, y or z in turn; labels (n / 3,): names of the points, () where they have none.
     """
 
@@ -33,6 +34,7 @@ class PointDisplacement(StatedNoise):
     interpolation: sparse.csr_matrix[np.float64]
     measured: NDArray[np.float64]
     whitening: sparse.csr_matrix[np.float64]
+    over_errors: NDArray[np.float64]
     material: NDArray[np.float64]
     labels: tuple[str, ...] = ()
 
@@ -47,7 +49,8 @@ class PointDisplacement(StatedNoise):
 
     def point_motions(self, displacement: NDArray[np.float64]) -> PointMotions:
         """The points, or means of some, as measured and at their displacements (n,) mm."""
-        return PointMotions(self.material[::3], self.measured.reshape(-1, 3), displacement.reshape(-1, 3), self.labels)
+        measured, found = self.measured.reshape(-1, 3), displacement.reshape(-1, 3)
+        return PointMotions(self.material[::3], measured, found, self.over_errors, self.labels)
 
 
 def point_displacement(
@@ -69,10 +72,12 @@ def point_displacement(
     mean, sd, mixed = _means(table, number, file.correlation_mm or 0.0)
     of_nodes, n = sparse.csr_matrix(mean @ _interpolation(space, table, places, file, mean)), mean.shape[0]
     seen = np.unique(of_nodes.indices)
-    usual = float(np.mean(table.sd**-2.0) ** -0.5)  # of equal errors that tell as much
-    apart = np.eye(3)
+    of_one = np.asarray(mean @ table.sd)
+    over_errors = np.eye(3) / of_one[:, :, None]
     if file.covariance_mm2 is not None:  # of all points
-        apart = usual * np.linalg.inv(np.linalg.cholesky(file.covariance_mm2))
+        over_errors = np.tile(np.linalg.inv(np.linalg.cholesky(file.covariance_mm2)), (n, 1, 1))
+    usual = float(3.0 * np.mean(over_errors**2)) ** -0.5  # of equal errors that tell as much
+    apart = sparse.bsr_array((usual * over_errors * (of_one / sd)[:, None], np.arange(n), np.arange(n + 1)))
     return PointDisplacement(
         file.name,
         *stated_noise(usual, 3 * n),
@@ -80,7 +85,8 @@ def point_displacement(
         dofs=(3 * seen[:, None] + np.arange(3)).ravel(),
         interpolation=sparse.csr_matrix(sparse.kron(of_nodes[:, seen], sparse.eye_array(3))),
         measured=np.asarray(mean @ table.moved).ravel(),
-        whitening=sparse.csr_matrix(sparse.kron(mixed, apart) @ sparse.diags_array(usual / sd.ravel())),
+        whitening=sparse.csr_matrix(sparse.kron(mixed, sparse.eye_array(3)) @ apart),
+        over_errors=over_errors,
         material=np.repeat(np.asarray(mean @ table.before), 3, axis=0),
         labels=labels,
     )

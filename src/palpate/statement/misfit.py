@@ -93,7 +93,8 @@ def _of_points(line: Linearisation, motions: PointMotions) -> Misfit | None:
     usual = float(np.sqrt(chi2.isf(TAIL, 3)))
     off = sizes > RELEVANT * usual
     left = motions.fitted - motions.observed
-    alone, count = _alone(line, left, sd)
+    alone = np.einsum("nij,nj->ni", motions.over_errors, left)
+    count = _independent(line, motions.over_errors)
     smooth, limit = _worst_direction(alone), _limit(count, DIRECTIONS)
     times, direction = _worst_direction(scaled)
     sure = bool(motions.labels) and sizes.max() > np.sqrt(chi2.isf(CHANCE / n, 3))
@@ -168,16 +169,15 @@ def _of_instrument(line: Linearisation, seen: OfInstrument) -> Misfit | None:
     return Misfit(observation.name, line.state, times, f"{what} by {times:.2g} times its stated error", text)
 
 
-def _alone(line: Linearisation, left: NDArray[np.float64], sd: float) -> tuple[NDArray[np.float64], float]:
-    """What is left (n, 3) mm of each point, over its stated error, and how many independent ones that is at the least.
+def _independent(line: Linearisation, over_errors: NDArray[np.float64]) -> float:
+    """How many independent points a field amounts to at the least, by what is known of the mean of all.
 
     Of errors that are alike a smooth misfit is a few of n independent residuals, and no larger than these in their
-    mean. The number is that by which the mean is known: (1 x c)^T C^-1 (1 x c) of the covariance C, at a unit vector c.
+    mean: (1 x I)^T C^-1 (1 x I) of the correlation C of the points' errors.
     """
-    same = np.asarray(line.residuals.jacobian @ np.tile(np.eye(3), (len(left), 1)))
-    information = same.T @ same
-    count = 3.0 / float(np.trace(np.linalg.inv(information)))
-    return left @ np.linalg.cholesky(information / count) / sd, min(count, float(len(left)))
+    usual = line.observation.first_noise((line.observation,)).sd
+    of_one = np.asarray(line.residuals.jacobian @ np.linalg.inv(over_errors).reshape(-1, 3)) / usual
+    return min(float(np.sum(of_one**2)) / 3.0, float(len(over_errors)))
 
 
 def _worst_direction(scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -156,7 +156,7 @@ class ParameterMap:
 
     def in_words(self, unknowns: NDArray[np.float64]) -> str:
         """The parameters' values at unknowns (n_unknowns,), for the progress."""
-        ratios = zip(self.tissues, np.exp(unknowns), strict=False)
+        ratios = zip(self.tissues, np.exp(unknowns[: self.n_parameters]), strict=True)
         return ", ".join(f"{name} {ratio:.2f} x {self.relative_to}" for name, ratio in ratios)
 
     @property
