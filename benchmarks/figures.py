@@ -175,6 +175,7 @@ EXAMPLES = {
     "block": "06_dvc_block",
     "breast": "07_breast_by_gravity",
     "beam": "08_soft_beam",
+    "skin": "09_skin",
 }
 
 
