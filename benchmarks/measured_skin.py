@@ -160,7 +160,9 @@ def _series(data: Path, specimen: Specimen) -> Series:
     centre = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
     shift = centre + KELOID_SHIFT if specimen.from_centre else HEALTHY_ORIGIN
     pads = np.stack([moving - moving[0], fixed - fixed[0]], axis=1)
-    return Series(later[0] + shift, later + shift, -pads[:, 0, 0], pads, -machine, -force)
+    frames, readings = (1 + int(np.argmax(of)) for of in (-pads[:, 0, 0], -machine))  # of loading alone
+    own = later[:frames] + shift, -pads[:frames, 0, 0], pads[:frames]
+    return Series(own[0][0], *own, -machine[:readings], -force[:readings])
 
 
 def _fitted(data: Path, folder: Path, specimen: Specimen, series: Series, fit_mm: float) -> CaseResult:

@@ -2,7 +2,7 @@
 
     python benchmarks/patients.py [--images 1,2,4,8] [--noise 0.15,0.3] [--laws linear] [--patients 4]
                                   [--cohort [8]] [--cohort-images 6] [--cohort-noise 0.3]
-                                  [--first-seed 901] [--cache FOLDER] [--output FILE] [--json]
+                                  [--alternating] [--first-seed 901] [--cache FOLDER] [--output FILE] [--json]
     python benchmarks/patients.py --summary [--output FILE]      # no run: tables of the lines that are there
 
 Simulated patients, everything at once: one body, of which every later image shows another filling of the rectum (5 to
@@ -10,6 +10,9 @@ Simulated patients, everything at once: one body, of which every later image sho
 of their own (correlated over 6 mm); ln E varies by 0.3 (25 mm) in every tissue; voxels of 1 x 1 x 2 mm. The same images
 serve every number of images. Each estimate runs in a process of its own, with default settings. One line of JSON an
 estimate: moduli, truths, intervals, verdicts, seconds of processor and wall, peak memory.
+
+--alternating: every second later image shows nearly the filling of the reference image (0 to 1 mm), so that errors in
+drawing that image are told apart from what moved.
 
 --cohort adds such patients, half of a lower and half of a higher stage (by turns), one joint estimate each. Prostates
 of the higher stage are stiffer by a factor of 1.3; the moduli of all patients scatter by 0.2 in ln E. The effect of the
@@ -53,6 +56,7 @@ def main() -> int:
     parser.add_argument("--images", default="1,2,4,8")
     parser.add_argument("--noise", default="0.15,0.3", help="standard deviations of the surfaces' errors, mm")
     parser.add_argument("--laws", default="linear")
+    parser.add_argument("--alternating", action="store_true", help="every second later image as full as the first")
     parser.add_argument("--cohort", type=int, nargs="?", const=8, default=0, help="patients of the cohort")
     parser.add_argument("--cohort-images", type=int, default=6, help="later images of each of them")
     parser.add_argument("--cohort-noise", type=float, default=0.3, help="their surfaces' errors, mm")
@@ -77,7 +81,7 @@ def _wanted(asked: argparse.Namespace) -> Iterator[tuple[Patient, int]]:
         for law in asked.laws.split(","):
             for noise in map(float, asked.noise.split(",")):
                 for n in map(int, asked.images.split(",")):
-                    yield Patient(seed, law, noise), n
+                    yield Patient(seed, law, noise, alternating=asked.alternating), n
     for k in range(asked.cohort):
         for law in asked.laws.split(","):
             yield Patient(asked.first_seed + k, law, asked.cohort_noise, k % 2), asked.cohort_images
@@ -122,7 +126,7 @@ def summary_of(results: Sequence[Mapping[str, Any]]) -> dict[str, Result]:
     """
     found = dict[str, Result]()
     for kind, own in _kinds([row for row in results if row.get("stage") is None]).items():
-        law, noise, images = kind
+        law, noise, images, alternating = kind
         items = [item for row in own for item in row.get("estimates", ())]
         errors = [abs(np.log(item["value"] / item["truth"])) for item in items if item["value"] is not None]
         ends = [item["interval95"] for item in items if item["interval95"]]
@@ -131,6 +135,7 @@ def summary_of(results: Sequence[Mapping[str, Any]]) -> dict[str, Result]:
             "law": law,
             "noise_mm": noise,
             "images": images,
+            "alternating": alternating,
             "patients": len(own),
             "failed": sum(row["status"] != "converged" for row in own),
             "moduli": len(items),
@@ -188,14 +193,14 @@ def _record(row: Mapping[str, Any]) -> Record:
     return Record(of, "done", moduli=moduli, seconds=row["seconds"], warnings=tuple(row["warnings"]))
 
 
-def _kinds(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, float, int], list[Mapping[str, Any]]]:
-    """The rows by law, noise (mm) and number of later images, in their order."""
-    keys = sorted({(row["law"], row["noise_mm"], row["images"]) for row in rows})
-    return {key: [row for row in rows if (row["law"], row["noise_mm"], row["images"]) == key] for key in keys}
+def _kinds(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, float, int, bool], list[Mapping[str, Any]]]:
+    """The rows by law, noise (mm), number of later images, and whether fillings alternate, in their order."""
+    of = [(row["law"], row["noise_mm"], row["images"], row.get("alternating", False)) for row in rows]
+    return {key: [row for row, own in zip(rows, of, strict=True) if own == key] for key in sorted(set(of))}
 
 
-def _name(law: str, noise: float, images: int) -> str:
-    return f"{law}, {noise:g} mm, {images}"
+def _name(law: str, noise: float, images: int, alternating: bool) -> str:
+    return f"{law}, {noise:g} mm, {images}{', alternating' * alternating}"
 
 
 def _of(rows: Sequence[Mapping[str, Any]], key: str, what: Any) -> Any:

@@ -517,7 +517,7 @@ def _refuse_version(found: int, path: Path) -> None:
 
 MOST = 8  # later images of a patient that are made
 PATIENT_EDGE_MM, PATIENT_SPACING_MM = 3.0, (1.0, 1.0, 2.0)
-FILLING_MM = (5.0, 8.0)
+FILLING_MM, STILL_MM = (5.0, 8.0), (0.0, 1.0)
 PATIENT_BORDER_MM, PATIENT_BORDER_LENGTH_MM = 1.0, 60.0
 PATIENT_SHIFT_MM, PATIENT_SHIFT_DEG = 3.0, 2.0
 PATIENT_FIELD_SD, PATIENT_FIELD_LENGTH_MM = 0.3, 25.0
@@ -526,18 +526,22 @@ LOWER_KPA, SCATTER = {"prostate": 25.0, "bladder": 30.0}, 0.2  # of the cohort: 
 
 
 class Patient(NamedTuple):
-    """A simulated patient; stage: 0 or 1 in the cohort, None: a patient with the moduli of the seed."""
+    """A simulated patient; stage: 0 or 1 in the cohort, None: a patient with the moduli of the seed.
+
+    alternating: every second later image shows nearly the filling of the reference image.
+    """
 
     seed: int
     law: str
     noise_mm: float
     stage: int | None = None
+    alternating: bool = False
 
     @property
     def name(self) -> str:
         """Of the folder."""
         of_stage = "" if self.stage is None else f"-stage{self.stage}"
-        return f"patient-{self.seed}-{self.law}-{self.noise_mm:g}mm{of_stage}"
+        return f"patient-{self.seed}-{self.law}-{self.noise_mm:g}mm{of_stage}{'-alternating' * self.alternating}"
 
     @property
     def moduli_kpa(self) -> dict[str, float] | None:
@@ -559,7 +563,7 @@ def patient_folder(patient: Patient, cache: Path) -> Path:
     folder = cache / patient.name
     if (folder / "truth.json").exists():
         return folder
-    seed, law, noise_mm, stage = patient
+    seed, law, noise_mm, stage, alternating = patient
     rng = np.random.default_rng([seed, 89])
     options = PelvisOptions(seed, spacing_mm=PATIENT_SPACING_MM, field_mm=LARGER_MM, truth_edge_mm=PATIENT_EDGE_MM)
     options = replace(options, law=law, moduli_kpa=patient.moduli_kpa)
@@ -567,7 +571,7 @@ def patient_folder(patient: Patient, cache: Path) -> Path:
     space = lagrange_space(mesh, "P2")
     motions = []
     for number in range(1, MOST + 1):
-        filling = float(rng.uniform(*FILLING_MM))
+        filling = float(rng.uniform(*(STILL_MM if alternating and number % 2 == 0 else FILLING_MM)))
         walls = pelvis_motions(replace(options, filling_mm=filling, motion_seed=number))
         border, _ = border_motion(rng, space, PATIENT_BORDER_MM, PATIENT_BORDER_LENGTH_MM)
         motions.append(BoundaryMotion(walls, border))
