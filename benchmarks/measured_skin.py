@@ -91,7 +91,7 @@ class Series:
         return float(np.interp(pull_mm, self.machine_mm, self.force_n, right=np.nan))
 
     def line(self, pull_mm: float) -> tuple[float, float, float]:
-        """Slope (N/mm) and start (N) of the line through the later half of the forces up to a pull; the rest's rms, N."""
+        """Slope (N/mm) and start (N) of the line through the later half of the forces up to a pull; the rest, N."""
         half = (self.machine_mm >= 0.5 * pull_mm) & (self.machine_mm <= pull_mm)
         slope, start = np.polyfit(self.machine_mm[half], self.force_n[half], 1)
         rest = self.force_n[half] - slope * self.machine_mm[half] - start

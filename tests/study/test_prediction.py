@@ -12,6 +12,7 @@ import pytest
 from palpate.body.body import make_body
 from palpate.body.imaged import aligned
 from palpate.case.case import Case, CaseTissue, Discrepancy, DriverMotion, Images, Mechanics, MeshSettings, Noise
+from palpate.images.grey_field import GreyField
 from palpate.images.segmentation import segment
 from palpate.images.tissue import Role
 from palpate.observation import DataFile, Landmarks, PointTable, stated_sd
@@ -148,3 +149,14 @@ def test_data_are_worth_what_they_tell_beside_the_others(worth_of):
     assert np.all(useless[:, 0] > 2.0)
     assert np.all((best[:, 1] > good[:, 1]) & (good[:, 1] > 1.0))
     assert np.all(best[:, 0] < good[:, 0])
+
+
+@pytest.mark.parametrize(("mean_mm", "low", "high"), [(1e3, 1.0, 1.001), (0.05, 1.5, np.inf)])
+def test_a_field_from_grey_images_is_worth_what_its_error_allows(states, mean_mm, low, high):
+    body = make_body(states, case_of(coarse_balls()), progress=silent)
+    grey = [GreyField(name, 10.0, 1.0, mean_mm, mean_mm, at_least=False) for name in ("core", "shell", "surroundings")]
+    grey = [of for of in grey if of.tissue in {tissue.name for tissue in body.space.mesh.tissues}]
+    found = predicted_intervals([body], case_of(coarse_balls()), progress=silent, grey=grey)
+    assert set(found.narrower) == set(GIVEN)
+    assert all(low * (1.0 - 1e-6) <= factor < high for factor in found.narrower.values())
+    assert ("hardly help" in found.lines()[-1]) == (mean_mm > 1.0)

@@ -38,7 +38,8 @@ def checked_with_page(
     missing = AFTER_PROBLEMS
     if checked.case is not None and checked.bodies:
         try:
-            predicted = predicted_intervals(checked.bodies, checked.case, progress=progress)
+            own = checked.bodies, checked.case
+            predicted = predicted_intervals(*own, progress=progress, grey=checked.report.grey)
             checked = replace(checked, report=replace(checked.report, predicted=predicted))
         except PalpateError as error:
             missing = f"There is no prediction: {error}"

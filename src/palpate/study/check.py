@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,7 +27,7 @@ from palpate.body.read import measured, read_case_images, read_segmentation, rea
 from palpate.body.refusals import refuse_lost, refuse_unmeshable, require_samples
 from palpate.case.case import Case
 from palpate.case.file import read_case
-from palpate.errors import PalpateError, ResourceError
+from palpate.errors import InputDataError, PalpateError, ResourceError
 from palpate.findings import HELP, Finding, help_on, of_pair, one_a_cause, rank, with_places
 from palpate.images.checks import (
     OBSERVED,
@@ -38,6 +38,8 @@ from palpate.images.checks import (
     refuse_absent,
     refuse_unit,
 )
+from palpate.images.grey_field import GreyField, grey_fields
+from palpate.images.label_image import VoxelGrid
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities
 from palpate.images.registration import Registration, length_text
@@ -84,7 +86,8 @@ class CheckReport:
     """All problems of a case, its organs and the expected cost of its estimate (None when that is unknown).
 
     alignments: how each later image lay, by its name; none where nothing was aligned; measured: in words what was read
-    from each file of [[data]], by its name; predicted: the expected intervals, where they were asked for.
+    from each file of [[data]], by its name; grey: what a field between the first two grey images would tell; predicted:
+    the expected intervals, where they were asked for.
     """
 
     id: str
@@ -94,6 +97,7 @@ class CheckReport:
     cost: ExpectedCost | None = None
     alignments: tuple[tuple[str, Registration], ...] = ()
     measured: Mapping[str, str] = field(default_factory=dict)
+    grey: tuple[GreyField, ...] = ()
     predicted: Prediction | None = None
 
     def __str__(self) -> str:
@@ -124,6 +128,7 @@ class CheckReport:
             ],
             "alignment": [found.row(name) for name, found in self.alignments],
             "data": dict(self.measured),
+            "grey": [asdict(of) for of in self.grey],
             "organs": [
                 {
                     "tissue": row.tissue,
@@ -159,6 +164,7 @@ class CheckReport:
             kept = ", ".join(f"{tissue} {length_text(mm)}" for tissue, mm in found.residual_by_tissue_mm.items())
             lines.append(f"alignment: '{name}' {found.in_words} (surfaces then lie apart by, in mm: {kept})")
         lines += [f"{name}: {words}" for name, words in self.measured.items()]
+        lines += [f"grey values of {of.tissue}: {of.in_words}" for of in self.grey]
         if self.cost is not None:
             lines.append(f"expected: {self.cost.in_words}")
         if self.predicted is not None:
@@ -272,7 +278,8 @@ def checked_case(
     ]
     files = [(source.file, source.in_words) for pair in pairs for source in pair.data]
     measured_words = {f.name + (f", state {f.state}" if f.state > 1 else ""): words for f, words in files}
-    report = CheckReport(case.id, problems.all(), names, organs, cost, tuple(found), measured_words)
+    grey = problems.attempt(partial(_grey_fields, case, pairs[0])) or ()
+    report = CheckReport(case.id, problems.all(), names, organs, cost, tuple(found), measured_words, grey)
     return Checked(report, case, tuple(pairs), bodies)
 
 
@@ -288,6 +295,23 @@ def _remarks(problems: _Problems, case: Case, pairs: Sequence[ImagedStates]) -> 
         except PalpateError as error:
             text = f"The report will show labels instead of the grey image, which cannot be read. {error}"
             problems.add(Problem("report", text))
+
+
+def _grey_fields(case: Case, states: ImagedStates) -> tuple[GreyField, ...]:
+    """What a field between the grey images of the first two states would tell; nothing without the first one."""
+    images = case.images
+    if images is None or images.intensities_before is None:
+        return ()
+    try:
+        before = (*read_intensities(images.intensities_before), states.before)
+        if not images.intensities_after or states.later[0].image is None:
+            return grey_fields(before)
+        values, grid = read_intensities(images.intensities_after[0])
+    except InputDataError:  # of which `_remarks` tells
+        return ()
+    if (found := states.later[0].alignment) is not None:
+        grid = VoxelGrid(grid.shape, found.motion.inverse().matrix @ grid.affine)
+    return grey_fields(before, (values, grid, states.later[0].image))
 
 
 def _cost(
