@@ -29,6 +29,7 @@ Misleading = Literal[
     "relaxed-state",
     "void-moves",
     "drawn-otherwise",
+    "segmented-otherwise",
     "layer",
     "several-bodies",
     "open-contours",

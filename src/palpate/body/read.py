@@ -20,6 +20,7 @@ from palpate.images.body_in_ct import outside_body
 from palpate.images.label_table import read_label_table
 from palpate.images.readers import read_intensities, read_label_image
 from palpate.images.readers.registry import format_of
+from palpate.images.run_report import segmented_otherwise
 from palpate.images.segmentation import Segmentation, segment
 from palpate.images.tissue import Tissue
 from palpate.observation.contract import DataSource
@@ -160,6 +161,7 @@ def _read_pair(case: Case, pair: ImagePair, *, progress: Progress) -> ImagedStat
     later = tuple(read_segmentation(case, path, names, reference.tissues) for path in pair.after)
     first, loaded = pair.numbers.start, bool(case.loads)
     states = aligned(reference, later, method=case.align, first=first, loaded=loaded, progress=progress)
+    states = replace(states, findings=(*states.findings, *segmented_otherwise(pair.before, pair.after)))
     inputs = {"names": names.sha256} if names else {}
     for (key, path), image in zip(pair.paths.items(), (reference, *later), strict=True):
         digests = image.digests or {"": file_digest(path)}  # a reader from elsewhere may not say what it read
