@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rows import Job, Result, collected, holds, median, parser_of, printed, rms, seeds_of
+from rows import Job, Result, collected, holds, median, parser_of, peak_gb, printed, rms, seeds_of
 
 import palpate
 from palpate.cohort.records import Record, modulus_of
@@ -107,7 +107,7 @@ def _estimated(path: Path) -> Result:
         "estimates": [{key: item[key] for key in KEPT} for item in document["estimates"]],
         "seconds": round(time.perf_counter() - began, 1),
         "processor_seconds": round(spent.ru_utime + spent.ru_stime, 1),
-        "peak_gb": round(spent.ru_maxrss * 1024 / 1e9, 2),
+        "peak_gb": round(peak_gb(), 2),
         "warnings": sorted({warning["code"] for warning in document["warnings"]}),
     }
 

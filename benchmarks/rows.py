@@ -183,6 +183,12 @@ def holds(interval: Sequence[float | None], truth: float = 0.0) -> bool:
     return (low is None or low <= truth) and (high is None or truth <= high)
 
 
+def peak_gb() -> float:
+    """The largest memory of this process, GB. That of getrusage begins with what the process had that started it."""
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM:")) * 1024.0 / 1e9
+
+
 def said(message: str) -> None:
     """Tell what happens."""
     print(message, file=sys.stderr, flush=True)

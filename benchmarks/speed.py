@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rows import said, silent
+from rows import peak_gb, said, silent
 from scipy import sparse
 from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import splu
@@ -103,12 +103,6 @@ def _child(name: str, *words: object) -> Any:
     """What a function of CHILDREN returns in a process of its own, whose peak memory is its own."""
     command = [sys.executable, __file__, "--child", name, *map(str, words)]
     return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
-
-
-def peak_mb() -> float:
-    """Peak memory of this process in MB, on Linux; getrusage would report at least the parent's for a new process."""
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024.0
 
 
 # ---- whole cases -----------------------------------------------------------------------------------------------------
@@ -328,7 +322,7 @@ def _estimated(sizes: Sizes, seed: int, law: str) -> Result:
         "ratios": np.exp(unknowns[: objective.n_parameters]).tolist(),
         "evaluations": inversion.evaluations,
         "factorisations": inversion.counts.factorisations,
-        "peak_mb": peak_mb(),
+        "peak_mb": 1e3 * peak_gb(),
     }
 
 
@@ -426,7 +420,7 @@ def _solver(name: str, path: str) -> Result:
     clocks.append(_clock())
     solution = solve(rhs)
     clocks.append(_clock())
-    peak, residual = peak_mb(), float(np.linalg.norm(matrix @ solution - rhs) / np.linalg.norm(rhs))
+    peak, residual = 1e3 * peak_gb(), float(np.linalg.norm(matrix @ solution - rhs) / np.linalg.norm(rhs))
     if name != "superlu":
         del solve, solution
         began = _clock()
@@ -461,7 +455,7 @@ def _one_size(edge_mm: str, seed: str) -> Result:
     values = system.solve(np.ones(model.n_modes)).values
     system.modulus_responses(values[:, None], regions=np.flatnonzero(moduli > 10.0))
     seconds, processor = time.perf_counter() - began, time.process_time() - cpu
-    return {"dofs": 3 * len(space.points), "seconds": seconds, "processor_s": processor, "peak_mb": peak_mb()}
+    return {"dofs": 3 * len(space.points), "seconds": seconds, "processor_s": processor, "peak_mb": 1e3 * peak_gb()}
 
 
 CHILDREN: dict[str, Callable[..., Any]] = {"make": _make, "solver": _solver, "size": _one_size}
