@@ -197,7 +197,7 @@ def test_simulating_with_the_truth_gives_the_later_image_back(inputs, tmp_path):
 
 
 def test_without_a_known_tissue_the_result_is_a_ratio(inputs, tmp_path):
-    settings = ["tissues.surroundings.role=estimate", "estimate.start_ratios=[0.3]", "noise.surface_sd_mm=0.05"]
+    settings = ["tissues.surroundings.role=estimate", "estimate.start_ratios=[0.3]"]
     flags = [flag for setting in settings for flag in ("--set", setting)]
     code = main(["estimate", str(inputs / "case.toml"), "--output", str(tmp_path), "--quiet", *flags])
     assert code == 0
