@@ -31,6 +31,8 @@ NEEDED = {
     "pressure_kpa": 'loads=[{kind="pressure", surface="outer", pressure_kpa=VALUE}]',
     "traction_kpa": 'loads=[{kind="traction", surface="outer", traction_kpa=[VALUE, 0.0, 0.0]}]',
     "acceleration_m_s2": 'loads=[{kind="gravity", acceleration_m_s2=[VALUE, 0.0, 0.0]}]',
+    "data.subset_mm": 'data=[{kind="displacement-field", file="f.csv", subset_mm=VALUE}]',
+    "data.frame": 'data=[{kind="displacement-field", file="f.npz", frame=VALUE}]',
     "start_ratios": "estimate={start_ratios=[VALUE], bounds_ratio=[2e-6, 9e5]}",
     "starts_kpa": "estimate={starts_kpa=[VALUE], bounds_kpa=[2e-3, 9e8]}",
     "bounds_ratio": "estimate={bounds_ratio=[1e-6, VALUE]}",
@@ -85,7 +87,7 @@ def test_what_lies_beyond_a_range_is_refused_with_the_range(place, end, tmp_path
     bound = NUMBERS[place].metadata["rule"].between[end]
     beyond = bound + (bound * 1e-3 or 1e-3) * (-1 if (end == 0) == (bound >= 0) else 1)
     key = place.rpartition(".")[2]
-    whole = isinstance(NUMBERS[place].default, int) or key == "stage"
+    whole = isinstance(NUMBERS[place].default, int) or key in ("stage", "frame")
     value = str(bound + (1, -1)[end == 0]) if whole else repr(beyond)
     template = NEEDED.get(place) or NEEDED.get(key, f"{place.replace('*', 'prostate')}=VALUE")
     override = template.replace("VALUE", value)

@@ -31,6 +31,7 @@ from palpate.mechanics.loads import pressure as pressure
 from palpate.mechanics.loads import traction as traction
 from palpate.mechanics.material import material_modes as material_modes
 from palpate.mechanics.newton import NewtonSettings as NewtonSettings
+from palpate.mechanics.reaction import surface_reaction as surface_reaction
 from palpate.mechanics.solvers.contract import Hints as Hints
 from palpate.mechanics.solvers.registry import SOLVERS as SOLVERS
 from palpate.mechanics.solvers.registry import expected_of_size as expected_of_size
