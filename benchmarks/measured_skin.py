@@ -20,10 +20,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from palpate import CaseResult
-from palpate.case import read_case
+from palpate import CaseResult, estimate, read_case
 from palpate.mechanics import choose_element, equilibrium, law_named, outer_constraint, surface_reaction
-from palpate.study import estimate
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
