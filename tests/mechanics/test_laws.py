@@ -160,3 +160,39 @@ def test_an_unknown_law_is_refused_with_the_names_of_all():
 def test_an_impossible_mooney_ratio_is_refused(ratio):
     with pytest.raises(ConfigurationError, match="c01_over_c10"):
         law_named("mooney-rivlin", c01_over_c10=ratio)
+
+
+def test_fung_energy_is_the_closed_form(gradients):
+    """W = mu/(2 b) (exp(b (I1 - 3 - 2 ln J)) - 1) + lambda/2 (ln J)^2."""
+    b = 1.5
+    log = np.log(np.linalg.det(gradients))
+    first = np.einsum("nij,nij->n", gradients, gradients)
+    expected = MU / (2.0 * b) * (np.exp(b * (first - 3.0 - 2.0 * log)) - 1.0) + LAME / 2.0 * log**2
+    assert np.allclose(energy(law_named("fung", fung_exponent=b), gradients, **CONSTANTS), expected, rtol=1e-12)
+
+
+def test_fung_with_a_small_exponent_is_neo_hookean(gradients):
+    found = stress(law_named("fung", fung_exponent=1e-9), gradients, **CONSTANTS)
+    assert np.allclose(found, stress(LAWS["neo-hookean"], gradients, **CONSTANTS), rtol=1e-7)
+
+
+@pytest.mark.parametrize("b", [5.0, 44.0])
+def test_a_pull_that_keeps_volume_stiffens_fung_by_one_and_nine_times_b_times_the_squared_strain(b):
+    """To second order in the strain, along the axis of the pull: the true stress over that of small strains."""
+
+    def pulled(law, strain):
+        stretch = 1.0 + strain
+        F = np.diag([stretch, stretch**-0.5, stretch**-0.5])[None]
+        P = stress(law, F, **CONSTANTS)[0]
+        return P[0, 0] * stretch - P[1, 1] * stretch**-0.5  # the pressure falls out
+
+    strain, step = 0.1 / np.sqrt(9.0 * b), 1e-6
+    laws = law_named("fung", fung_exponent=b), LAWS["neo-hookean"]
+    found, plain = (pulled(law, strain + step) - pulled(law, strain - step) for law in laws)
+    assert found / plain == pytest.approx(1.01, abs=2e-3)
+
+
+@pytest.mark.parametrize("b", [0.0, -1.0, np.inf, np.nan])
+def test_an_exponent_that_makes_no_law_is_refused(b):
+    with pytest.raises(ConfigurationError, match="fung_exponent"):
+        law_named("fung", fung_exponent=b)

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 
 from palpate.errors import ConfigurationError
 from palpate.mechanics.laws.contract import Law, LawParameter
+from palpate.mechanics.laws.fung import Fung
 from palpate.mechanics.laws.linear import Linear
 from palpate.mechanics.laws.mooney_rivlin import MooneyRivlin
 from palpate.mechanics.laws.neo_hookean import NeoHookean
 
-REGISTERED = (Linear, NeoHookean, MooneyRivlin)  # a new law is a file, and its class in this tuple
+REGISTERED = (Linear, NeoHookean, MooneyRivlin, Fung)  # a new law is a file, and its class in this tuple
 
 LAWS: dict[str, Law] = {law.name: law for law in (kind() for kind in REGISTERED)}
 
