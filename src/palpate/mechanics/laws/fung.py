@@ -19,7 +19,7 @@ from palpate.mechanics.laws.neo_hookean import NeoHookean
 
 Array = NDArray[np.float64]
 
-EXPONENT = LawParameter("fung_exponent", 5.0, 0.001, 10_000.0, "b of the law: how fast it stiffens; near 0 neo-hookean")
+EXPONENT = LawParameter("fung_exponent", 1.0, 0.001, 10_000.0, "b of the law: how fast it stiffens; near 0 neo-hookean")
 NEO_HOOKEAN = NeoHookean()
 MOST = 200.0  # exponent, beyond which no tissue is: numbers stay finite while Newton's method looks too far
 
