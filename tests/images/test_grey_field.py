@@ -82,3 +82,8 @@ def test_a_tissue_with_too_few_voxels_inside_has_no_row():
     index[30:35, 30:35, 30:35] = 1
     found = grey_fields((texture(1, 30.0), GRID, Segmentation(index, GRID, segmentation().tissues)))
     assert [of.tissue for of in found] == ["organ"]
+
+
+@pytest.mark.parametrize("values", [np.zeros(GRID.shape), np.full(GRID.shape, np.nan), np.full(GRID.shape, np.inf)])
+def test_an_image_without_noise_or_numbers_has_no_row(values):
+    assert grey_fields((values.astype(np.float32), GRID, segmentation())) == ()

@@ -89,7 +89,7 @@ def grey_fields(
     before: tuple[NDArray[Any], VoxelGrid, Segmentation],
     after: tuple[NDArray[Any], VoxelGrid, Segmentation] | None = None,
 ) -> tuple[GreyField, ...]:
-    """What a field between two grey images would tell of each meshed tissue, as far as it has enough voxels.
+    """What a field between two grey images would tell of each meshed tissue with enough voxels and some noise.
 
     before, after: values (n_x, n_y, n_z), their grid, and the tissues. Without the second one its noise is that of the
     first.
@@ -97,13 +97,14 @@ def grey_fields(
     first, second = _Grey(*before), None if after is None else _Grey(*after)
     found = []
     for number, tissue in enumerate(first.labels.tissues):
-        own = _covariances(first, number) if tissue.meshed else None
+        with np.errstate(invalid="ignore", over="ignore"):  # of values that are no numbers, which have no row
+            own = _covariances(first, number) if tissue.meshed else None
+            other = None if second is None else _covariances(second, number)
         if own is None:
             continue
-        other = None if second is None else _covariances(second, number)
         volume = float(np.count_nonzero(first.labels.mask(number)) * first.labels.grid.voxel_volume) / 1e3
         found.append(_field(tissue.name, own, other or own, 1e3 * MEAN_ML / first.grid.voxel_volume, volume))
-    return tuple(found)
+    return tuple(of for of in found if 0.0 < of.mean_mm < np.inf)  # not of an image without noise, or with NaN
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,11 +118,12 @@ class _Covariances:
 
 def _covariances(grey: _Grey, tissue: int) -> _Covariances | None:
     """Those of a tissue; None where it has too few voxels far enough from its border."""
-    grid, every = grey.grid, np.argwhere(grey.labels.mask(tissue))
+    grid, labels, every = grey.grid, grey.labels, np.flatnonzero(grey.labels.mask(tissue))
     sparse = max(len(every) / SAMPLES, 1.0)
     if sparse > 1.0:
-        every = every[np.random.default_rng(0).choice(len(every), SAMPLES, replace=False)]
-    places = np.unique(np.rint(grid.index(grey.labels.grid.world(every.astype(np.float64)))).astype(np.int64), axis=0)
+        every = np.random.default_rng(0).choice(every, SAMPLES, replace=False)
+    voxels = np.stack(np.unravel_index(every, labels.index.shape), axis=1).astype(np.float64)
+    places = np.unique(np.rint(grid.index(labels.grid.world(voxels))).astype(np.int64), axis=0)
     margin = APART + REACH + 1
     places = places[((places >= margin) & (places < np.array(grid.shape) - margin)).all(axis=1)]
     places = places[grey.all_in(tissue, places)]
