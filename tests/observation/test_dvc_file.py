@@ -133,6 +133,12 @@ def test_other_units_of_length_are_turned_to_mm(tmp_path, result, unit, millimet
     np.testing.assert_allclose([other.before, other.after, other.sd], [plain.before, plain.after, plain.sd])
 
 
+def test_axes_that_a_case_states_are_refused(tmp_path, result):
+    """The file has its own, which another word of the case would not turn."""
+    with pytest.raises(InputDataError, match="remove the key axes"):
+        read(npz(tmp_path / "a.npz", result), axes="LPS")
+
+
 def spoilt(result, name, value):
     return {key: array for key, array in (result | {name: value}).items() if array is not None}
 

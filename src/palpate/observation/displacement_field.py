@@ -17,6 +17,7 @@ from palpate.observation.field_file import read_field
 from palpate.observation.measured_points import MeasuredPoints
 from palpate.observation.point_table import PointTable, checked_table, read_point_table, stated_sd
 
+OWN_AXES = {".csv": "RAS"} | dict.fromkeys((".npz", ".vti"), "the axes of its volume, taken for RAS")
 FEWEST = 4  # points that are needed to measure a motion that varies in space
 COARSER = 2  # how often the edge of a cell is doubled at the most
 OF_LENGTH, OF_EDGE = 0.5, 0.6  # edge of a cell, over the correlation length and over an edge of the mesh
@@ -52,6 +53,11 @@ def read_displacement_field(file: DataFile) -> DisplacementField:
     path = file.paths[0]
     if len(file.paths) != 1:
         raise InputDataError(f"a displacement field is one file, but {len(file.paths)} are named; remove file_after")
+    if file.axes and path.suffix.lower() in OWN_AXES:
+        raise InputDataError(
+            f"'{path}' is in {OWN_AXES[path.suffix.lower()]}, but the case states {file.axes}; turn its places and"
+            " motions, and remove the key axes from [[data]]"
+        )
     if path.suffix.lower() == ".csv":
         table = read_point_table(file)
         if len(table.before) < FEWEST:
